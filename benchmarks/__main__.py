@@ -43,7 +43,7 @@ def _print_steps(rows: list[dict[str, Any]]) -> None:
         for name, value in row["parts_ms"].items():
             print(f"    {name:50}{value:9.2f} ms{1e6 * value / row['samples']:9.0f} ns/sample")
         for name, value in row["rivals"].items():
-            label = name if name == "every interval" else f"torch, {name}"
+            label = name if name == training_step.BEFORE else f"torch, {name}"
             print(f"    {label:50}{value['median_ms']:9.0f} ms{row['times_faster'][name]:9.1f} x ours")
         print(f"    {'share of the multiply-add limit, networks':50}{row['share_of_gflops']:9.2f}")
         added, slow = row["peak_added_mib"], row["peak_added_mib_unrolled"]

@@ -62,7 +62,7 @@ def kernels() -> dict[str, Launch]:
         field.reconstructing = reconstructing
         workspace = Workspace(field, capacity)
         made = [plan(workspace, merged=True) for plan in (plans.forward, plans.viewing)]
-        made += [plan(workspace) for plan in (plans.backward, plans.density)]
+        made += [plans.backward(workspace), plans.density(workspace, whole=True)]
         made += [plans.update(workspace, name) for name in workspace.modules]
         _add(found, (launch for launch in chain.from_iterable(made) if isinstance(launch, Launch)))
     return found

@@ -88,7 +88,7 @@ class PretendedField:
     def step(self, rates: object) -> None:
         pass
 
-    def density_of_first(self, count: Tensor, position: Tensor) -> Tensor:
+    def estimate(self, position: Tensor, count: Tensor) -> Tensor:
         return position.sum(1).abs()
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from dataclasses import replace
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -38,6 +39,7 @@ OPERATIONS = [
     (PoseParameters, "step", "Adam on poses"),
 ]
 BETWEEN_KERNELS = {"draw pixels", "pose matrices", "cast rays", "Adam on poses"}  # outside the field
+BEFORE = "every interval"  # the form without merging; counted with cells looked at by density
 FORWARD_MACS = 64 * 16 + 32 * 64 + 64 * 64 + 64 * 4  # of both networks but for the first layer
 
 
@@ -53,6 +55,23 @@ def _every_interval(ours: JointOptimiser) -> JointOptimiser:
     rival = copy.copy(ours)
     rival.method = replace(ours.method, merging=None)
     return rival
+
+
+def _cells_s(ours: JointOptimiser, rounds: int, clock: Clock) -> dict[str, float]:
+    """Seconds a step that the occupancy grid's updates take, by the estimate of the density and by the density."""
+    estimate, field = ours.field.estimate, ours.field
+    kept = {name: tensor.clone() for name, tensor in ours.occupancy.state().items()}
+
+    def looked(density: Any) -> None:
+        with patch.object(field, "estimate", density):
+            ours._update_occupancy(ours.step_index)
+
+    by_density = lambda position, count=None: field.density(position)  # noqa: E731
+    seconds = interleave(
+        {"estimate": lambda: looked(estimate), "density": lambda: looked(by_density)}, rounds, clock
+    )
+    ours.occupancy.load_state(kept)
+    return {name: float(np.median(each)) / OCCUPANCY_PERIOD for name, each in seconds.items()}
 
 
 def _alternatives(ours: JointOptimiser, definition: bool) -> dict[str, JointOptimiser]:
@@ -96,7 +115,7 @@ def run(
 
         rivals, unmerged = _alternatives(ours, definition), _every_interval(ours)
         competitors = {"kernels": lambda ours=ours: scene.step(ours, rays)}
-        competitors["every interval"] = lambda rival=unmerged: scene.step(rival, rays)
+        competitors[BEFORE] = lambda rival=unmerged: scene.step(rival, rays)
         competitors |= {name: lambda r=rival: torch_step(r) for name, rival in rivals.items()}
         seconds = interleave(competitors, rounds, clock)
         with peak_memory() as slow_memory:
@@ -104,13 +123,14 @@ def run(
         with peak_memory() as memory:
             medians = _parts_ms(ours, rays, 3 * rounds, clock)
         networks = _parts_ms(unmerged, rays, rounds, clock)
-        started = clock()
-        kept = ours.occupancy.occupied
-        ours._update_occupancy(ours.step_index)
-        occupancy = (clock() - started) / OCCUPANCY_PERIOD
-        ours.occupancy.occupied = kept
-        medians["occupancy update, per step"] = 1e3 * occupancy
-        fast = float(np.median(seconds["kernels"])) + occupancy
+        cells = _cells_s(ours, rounds, clock)
+        medians |= {f"occupancy, per step, by {name}": 1e3 * value for name, value in cells.items()}
+        fast = float(np.median(seconds["kernels"])) + cells["estimate"]
+        times_faster = {name: ratio(each, seconds["kernels"]) for name, each in seconds.items()}
+        times_faster[BEFORE] = ratio(
+            [s + cells["density"] for s in seconds[BEFORE]],
+            [s + cells["estimate"] for s in seconds["kernels"]],
+        )
         width = ours.field.shape.pose_grid.width + (
             ours.field.shape.reconstruction_grid.width if stage == "fine" else 0
         )
@@ -119,7 +139,7 @@ def run(
             "stage": stage, "rays": rays, "samples": samples, "kernels": summary(seconds["kernels"]),
             "ns_per_sample": 1e9 * fast / samples, "samples_per_s": samples / fast, "rays_per_s": rays / fast,
             "rivals": {name: summary(v) for name, v in seconds.items() if name != "kernels"},
-            "times_faster": {n: ratio(v, seconds["kernels"]) for n, v in seconds.items() if n != "kernels"},
+            "times_faster": times_faster,
             "parts_ms": medians, "share_of_gflops": _flops(width) * samples / network_s / 1e9 / limit["gflops"],
             "peak_added_mib": memory["added_mib"], "peak_added_mib_unrolled": slow_memory["added_mib"],
         })  # fmt: skip

@@ -2,6 +2,8 @@
 
 As NerfAcc and BAA-NGP: a running maximum of density times step, decaying by 0.95 per update; a cell is occupied
 above min(mean, 0.01). Everything counts as occupied until the first update with `prune`.
+
+The density is the field's estimate, as where intervals are merged: it costs a quarter, and the grid needs no more.
 """
 
 from __future__ import annotations
@@ -72,7 +74,7 @@ class OccupancyGrid:
         self.thickness *= DECAY
         for part in cells.split(DENSITY_CHUNK):
             position = self._points(part, generator)
-            density = field.density(position.to(self.device))
+            density = field.estimate(position.to(self.device))
             part = part.to(self.device)
             length = step * interval_growth(position.to(self.device)) if field.unbounded else step
             self.thickness[part] = torch.maximum(self.thickness[part], density * length)
@@ -121,7 +123,7 @@ class DeviceOccupancyGrid(OccupancyGrid):
         for begin in range(0, count, DENSITY_CHUNK):
             part = cells[begin : begin + DENSITY_CHUNK]
             position = self._points(part.clamp(max=count - 1), generator)
-            density = field.density_of_first((total - begin).clamp(0, len(part)), position)
+            density = field.estimate(position, (total - begin).clamp(0, len(part)))
             length = step * interval_growth(position) if field.unbounded else step
             found.scatter_(0, part, density * length)
         self.thickness *= DECAY

@@ -126,10 +126,11 @@ class RadianceField(ABC):
     def density(self, position: Tensor) -> Tensor:
         """Density [n] per unit length at grid positions [n, 3] in [0, 1]; no gradient."""
 
-    def density_of_first(self, count: Tensor, position: Tensor) -> Tensor:
-        """Density [n] at positions [n, 3], of which only the first `count` [1] matter; no gradient.
+    def estimate(self, position: Tensor, count: Tensor | None = None) -> Tensor:
+        """Density [n] at grid positions [n, 3] as the pose-estimation module alone gives it; no gradient.
 
-        The others' densities are arbitrary. A backend may leave them out if it need not wait for `count`.
+        A field without modules has only its density. If `count` [1] is given, only the first `count` densities matter:
+        a backend may leave the others out if it need not wait for the number.
         """
         return self.density(position)
 

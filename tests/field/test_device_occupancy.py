@@ -18,14 +18,13 @@ class Ball:
         self.unbounded = unbounded
         self.counts: list[int] = []
 
-    def density(self, position: torch.Tensor) -> torch.Tensor:
+    def estimate(self, position: torch.Tensor, count: torch.Tensor | None = None) -> torch.Tensor:
         assert position.min() >= 0
         assert position.max() <= 1
-        return torch.where((position - 0.5).norm(dim=1) < 0.3, 50.0, 0.0)
-
-    def density_of_first(self, count: torch.Tensor, position: torch.Tensor) -> torch.Tensor:
+        density = torch.where((position - 0.5).norm(dim=1) < 0.3, 50.0, 0.0)
+        if count is None:
+            return density
         self.counts.append(int(count))
-        density = self.density(position)
         return torch.where(torch.arange(len(density), device=DEVICE) < count, density, float("nan"))
 
 

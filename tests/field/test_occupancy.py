@@ -19,7 +19,7 @@ class Slab:
     def __init__(self, elsewhere: float = 0.0) -> None:
         self.elsewhere, self.asked = elsewhere, 0
 
-    def density(self, position: torch.Tensor) -> torch.Tensor:
+    def estimate(self, position: torch.Tensor) -> torch.Tensor:
         self.asked += len(position)
         assert position.min() >= 0
         assert position.max() <= 1
@@ -72,7 +72,7 @@ def test_thin_matter_counts_where_all_is_thin():
     update(grid, Slab(elsewhere=1e-4))
     assert columns(grid) == [3]
     thin = Slab(elsewhere=0.5)  # thickness 0.005: below 0.01 yet not empty
-    thin.density = lambda position: torch.where(position[:, 0] < 0.5, 0.5, 0.0)
+    thin.estimate = lambda position: torch.where(position[:, 0] < 0.5, 0.5, 0.0)
     grid = OccupancyGrid(SIDE, CPU)
     update(grid, thin)
     assert columns(grid) == [0, 1, 2, 3]
@@ -82,7 +82,7 @@ def test_what_has_gone_is_forgotten_by_and_by():
     grid = OccupancyGrid(SIDE, CPU)
     update(grid, Slab())
     gone = Slab()
-    gone.density = lambda position: torch.where(position[:, 0] < 1 / 8, 50.0, 0.0)
+    gone.estimate = lambda position: torch.where(position[:, 0] < 1 / 8, 50.0, 0.0)
     needed = 0
     while 3 in columns(grid):
         update(grid, gone)
@@ -102,7 +102,7 @@ def test_a_partial_update_looks_at_the_occupied_and_a_quarter_of_the_rest():
 def test_new_matter_is_found_by_partial_updates():
     grid = OccupancyGrid(SIDE, CPU)
     empty = Slab()
-    empty.density = lambda position: torch.where(position[:, 0] > 7 / 8, 50.0, 0.0)
+    empty.estimate = lambda position: torch.where(position[:, 0] > 7 / 8, 50.0, 0.0)
     update(grid, empty)
     assert columns(grid) == [7]
     generator = torch.Generator().manual_seed(0)

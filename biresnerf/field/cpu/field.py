@@ -117,6 +117,11 @@ class CpuField(GridField):
         self._density(position.contiguous().numpy().reshape(-1), self.modules, result)
         return torch.from_numpy(result)
 
+    def estimate(self, position: Tensor, count: Tensor | None = None) -> Tensor:
+        result = np.empty(len(position), f4)
+        self._density(position.contiguous().numpy().reshape(-1), MODULES[:1], result)
+        return torch.from_numpy(result)
+
     def _density(self, x: np.ndarray, modules: tuple[str, ...], density: np.ndarray) -> None:
         """Fill `density` [n] with that which these modules give at x [3 n]."""
         features, _ = self._encode(x, None, "density", modules)

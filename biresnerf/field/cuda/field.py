@@ -74,9 +74,14 @@ class CudaField(GridField):
         return self._view(rays, marching, gradient)
 
     def density(self, position: Tensor) -> Tensor:
-        return self.density_of_first(torch.full((1,), len(position), device=self.device), position)
+        return self._density(position, None, whole=True)
 
-    def density_of_first(self, count: Tensor, position: Tensor) -> Tensor:
+    def estimate(self, position: Tensor, count: Tensor | None = None) -> Tensor:
+        return self._density(position, count, whole=False)
+
+    def _density(self, position: Tensor, count: Tensor | None, *, whole: bool) -> Tensor:
+        if count is None:
+            count = torch.full((1,), len(position), device=self.device)
         w = self._reserve(0, 1, 1, 1 if self._workspace is None else self._workspace.capacity.side)
         self._forward_number += 1
         results = [position.new_zeros(0)]
@@ -85,7 +90,7 @@ class CudaField(GridField):
             w.buffers["x"][:, : len(part)].copy_(part.T)
             w.buffers["taken"].copy_((count - begin).clamp(0, len(part)))
             w.record()
-            w.plan(plans.density).run()
+            w.plan(plans.density, whole).run()
             results.append(w.buffers["density"][: len(part)].clone())
         return torch.cat(results)
 

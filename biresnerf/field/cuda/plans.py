@@ -65,11 +65,15 @@ def backward(w: Workspace) -> list[Any]:
     return launches
 
 
-def density(w: Workspace) -> list[Any]:
-    """Density of the points that are given as samples."""
+def density(w: Workspace, whole: bool) -> list[Any]:
+    """Density of the points that are given as samples, or what the pose-estimation module alone makes of it."""
+    if whole:
+        modules, features = w.modules, {}
+    else:
+        modules, features = w.modules[:1], {"HIGH": 0}
     return [
-        *_encoding(w, w.modules, with_jacobian=False),
-        _per_tile(network.network_forward, w, WITH_COLOUR=False),
+        *_encoding(w, modules, with_jacobian=False),
+        _per_tile(network.network_forward, w, WITH_COLOUR=False, **features),
     ]
 
 
@@ -105,8 +109,7 @@ def _packing(w: Workspace) -> list[Any]:
 def _merging(w: Workspace) -> list[Any]:
     """Merge intervals by the densities of the pose-estimation module, and pack them again."""
     return [
-        *_encoding(w, w.modules[:1], with_jacobian=False),
-        _per_tile(network.network_forward, w, WITH_COLOUR=False, HIGH=0),
+        *density(w, whole=False),
         _per_ray_block(
             merging.merge,
             w,

@@ -44,7 +44,7 @@ class ReferenceField(GridField):
             )  # fmt: skip
             samples = len(ray)
             if marching.merging is not None:
-                estimate = self._pose_density(self._positions(rays, t, ray))
+                estimate = self.estimate(self._positions(rays, t, ray))
                 t, dt, ray = reference.merge(estimate, t, dt, ray, rays.jitter, marching.merging)
         x = self._positions(rays, t, ray)
         view = spherical_harmonics(rays.direction)[ray]
@@ -76,8 +76,7 @@ class ReferenceField(GridField):
         return reference.density(*self._features(position, PositionGradient()))
 
     @torch.no_grad()
-    def _pose_density(self, position: Tensor) -> Tensor:
-        """The density [n] that the pose-estimation module alone gives."""
+    def estimate(self, position: Tensor, count: Tensor | None = None) -> Tensor:
         features = reference.encode(position, self.pose_table, self.shape.pose_grid)
         return reference.density(features, self.networks)
 

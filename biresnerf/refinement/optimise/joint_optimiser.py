@@ -245,7 +245,7 @@ class JointOptimiser:
             self.field,
             self.schedule.fine_interval,
             self.draws,
-            looked_at=self.schedule.empty_cells_looked_at(step, self.switch),
+            looked_at=self.schedule.empty_cells_looked_at(step),
             prune=self.schedule.pruned(step),
             dilate=self.schedule.dilated(self.switch),
         )

@@ -32,12 +32,8 @@ POSE_STAGE2_CAP = 1e-3
 LENS_START, LENS_SHARE = 0.5, 1.0
 FIELD_DIP = 0.3
 FREEZE_SHARE = 0.95  # of all steps: poses stand still from then on
-# In stage 1 as NerfAcc; in stage 2 empty space rarely fills again, and each look costs all levels.
-EMPTY_LOOKED_AT = (0.25, 1 / 16)
-FRESH_STEPS = (
-    256,
-    512,
-)  # from the start and from the switch: steps that look at all cells of the occupancy grid
+# As NerfAcc: from the start, steps that look at all cells of the occupancy grid; then the share of the empty ones.
+FRESH_STEPS, EMPTY_LOOKED_AT = 256, 0.25
 
 
 def smooth_ramp(q: float) -> float:
@@ -110,12 +106,9 @@ class Schedule:
         """Whether neighbours of occupied cells are looked into."""
         return switch is None
 
-    def empty_cells_looked_at(self, step: int, switch: int | None) -> float:
+    def empty_cells_looked_at(self, step: int) -> float:
         """Share of the empty cells that an update of the occupancy grid looks at."""
-        start, fresh = FRESH_STEPS
-        if step < start or (switch is not None and step - switch < fresh):
-            return 1.0
-        return EMPTY_LOOKED_AT[0 if switch is None else 1]
+        return 1.0 if step < FRESH_STEPS else EMPTY_LOOKED_AT
 
     def blur(self, step: int, switch: int | None, long_side: float) -> float:
         """Standard deviation (px) that photos are blurred with, before its random factor."""

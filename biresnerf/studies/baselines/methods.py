@@ -54,8 +54,8 @@ class PlainSchedule(Schedule):
     def dilated(self, switch: int | None) -> bool:
         return False
 
-    def empty_cells_looked_at(self, step: int, switch: int | None) -> float:
-        return 1.0 if step < self.first_looks * self.steps else EMPTY_LOOKED_AT[0]
+    def empty_cells_looked_at(self, step: int) -> float:
+        return 1.0 if step < self.first_looks * self.steps else EMPTY_LOOKED_AT
 
     def pose_rate(self, step: int, switch: int | None) -> float:
         return self._decayed_pose_rate(step / self.steps)

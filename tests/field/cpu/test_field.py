@@ -132,10 +132,12 @@ def test_no_live_sample_gives_background_and_zero_gradient():
     assert float(rays.origin.grad.abs().max()) == 0.0
 
 
-def test_density_equals_reference():
+def test_density_and_its_estimate_equal_the_reference():
     slow, fast = _pair(True, True)
     x = torch.rand(333, 3)
     torch.testing.assert_close(fast.density(x), slow.density(x), rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(fast.estimate(x), slow.estimate(x), rtol=1e-3, atol=1e-4)
+    assert not torch.allclose(slow.estimate(x), slow.density(x))
 
 
 def test_state_restores_the_next_step_exactly():

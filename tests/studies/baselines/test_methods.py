@@ -57,8 +57,8 @@ def test_barf_samples_depths_2_to_6_of_cameras_4_away_and_its_nerfacc_version_ev
 def test_all_cells_are_looked_at_for_the_first_256_steps_of_the_published_length():
     for method in ("baa-ngp", "nerfacc-barf", "biresnerf-paper"):
         s = schedule(method)
-        assert s.empty_cells_looked_at(255, 0) == 1
-        assert s.empty_cells_looked_at(257, 0) == 0.25
+        assert s.empty_cells_looked_at(255) == 1
+        assert s.empty_cells_looked_at(257) == 0.25
 
 
 def test_the_papers_reconstruction_module_warms_up_smoothly_from_nothing_at_the_switch():
