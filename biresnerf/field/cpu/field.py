@@ -57,7 +57,9 @@ class CpuField(GridField):
         largest = int(np.concatenate([np.diff(grid.offset) for grid in self.grids.values()]).max())
         self._scratch = np.zeros((workers, 2 * largest), f4)
         self._pending: tuple[Samples, np.ndarray] | None = None
-        # Tables and their moments stay where they are for good.
+        # Tables, their moments and weights stay where they are for good.
+        self._layers = [weight.detach().numpy() for weight in self.networks]
+        self._columns = self.reconstruction_columns.detach().numpy()
         self._words = {name: table.numpy().reshape(-1).view(np.uint64) for name, table in self.tables.items()}
         self._flat = {
             name: tuple(t.numpy().reshape(-1) for t in (table, *self.moments[name]))
@@ -73,17 +75,16 @@ class CpuField(GridField):
         """The columns of these modules, padded to whole tiles."""
         first = np.zeros((HIDDEN, self._width(modules)), f4)
         low = self.shape.pose_grid.width
-        first[:, :low] = self.networks[0].detach().numpy()
+        first[:, :low] = self._layers[0]
         if len(modules) > 1:
-            high = self.shape.reconstruction_grid.width
-            first[:, low : low + high] = self.reconstruction_columns.detach().numpy()
+            first[:, low : low + self._columns.shape[1]] = self._columns
         return first
 
     def _weights(self) -> tuple[np.ndarray, ...]:
         """The five layers as contiguous arrays; input columns padded to whole tiles, colour rows to 4."""
         last = np.zeros((4, HIDDEN), f4)
-        last[:3] = self.networks[4].detach().numpy()
-        return (self._first_layer(self.modules), *(w.detach().numpy() for w in self.networks[1:4]), last)
+        last[:3] = self._layers[4]
+        return (self._first_layer(self.modules), *self._layers[1:4], last)
 
     def _encode(
         self, x: np.ndarray, gradient: PositionGradient | None, role: str, modules: tuple[str, ...]
@@ -125,7 +126,7 @@ class CpuField(GridField):
     def _density(self, x: np.ndarray, modules: tuple[str, ...], density: np.ndarray) -> None:
         """Fill `density` [n] with that which these modules give at x [3 n]."""
         features, _ = self._encode(x, None, "density", modules)
-        w1, w2 = self._first_layer(modules).reshape(-1), self.networks[1].detach().numpy().reshape(-1)
+        w1, w2 = self._first_layer(modules).reshape(-1), self._layers[1].reshape(-1)
         network.network_density(
             features.reshape(-1), features.shape[0], w1, w2, density, tasks(), self.workers
         )

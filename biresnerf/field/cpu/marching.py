@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from biresnerf.field.cpu.matrix_blocks import exponential
-from biresnerf.field.cpu.vector_access import PARALLEL_KERNEL
+from biresnerf.field.cpu.vector_access import KERNEL, PARALLEL_KERNEL
 from biresnerf.field.numba_kernels import njit, prange
 from biresnerf.field.reference import operations
 
@@ -51,18 +51,39 @@ def clearances(occupied):
     """
     side = occupied.shape[0]
     block = BLOCK if side % BLOCK == 0 else 1
-    blocks = side // block
-    near = occupied.reshape(blocks, block, blocks, block, blocks, block).any(axis=(1, 3, 5))
-    distance = np.where(near, 0, FARTHEST).astype(np.uint8)
-    for away in range(1, FARTHEST):
-        for axis in range(3):
-            before = np.moveaxis(near, axis, 0)
-            wider = before.copy()
-            wider[1:] |= before[:-1]
-            wider[:-1] |= before[1:]
-            near = np.moveaxis(wider, 0, axis)
-        np.minimum(distance, away, out=distance, where=near & (distance > away))
+    distance = np.full((side // block,) * 3, FARTHEST, np.uint8)
+    _mark_occupied(occupied, block, distance)
+    # Two passes, from either end, carry distances to all blocks (Rosenfeld and Pfaltz 1966).
+    _carry_distances(distance)
+    _carry_distances(distance[::-1, ::-1, ::-1])
     return distance
+
+
+@njit(**KERNEL)
+def _mark_occupied(occupied, block, distance):
+    """Zero the distance of blocks with an occupied cell."""
+    for z in range(occupied.shape[0]):
+        for y in range(occupied.shape[1]):
+            row, cells = distance[z // block, y // block], occupied[z, y]
+            for b in range(row.shape[0]):
+                for x in range(b * block, (b + 1) * block):
+                    if cells[x]:
+                        row[b] = 0
+
+
+@njit(**KERNEL)
+def _carry_distances(distance):
+    """No block is farther than one more than its neighbours before it, in the order of memory or its reverse."""
+    blocks = distance.shape[0]
+    for z in range(blocks):
+        for y in range(blocks):
+            for x in range(blocks):
+                least = distance[z, y, x]
+                for at in range(13):
+                    u, v, w = z + at // 9 - 1, y + at // 3 % 3 - 1, x + at % 3 - 1
+                    if u >= 0 and 0 <= v < blocks and 0 <= w < blocks:
+                        least = min(least, distance[u, v, w] + 1)
+                distance[z, y, x] = least
 
 
 @njit(inline="always", fastmath=True)

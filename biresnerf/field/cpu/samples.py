@@ -7,6 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from biresnerf.field.cpu.vector_access import KERNEL
+from biresnerf.field.numba_kernels import njit
+
 SEGMENT, MOST_SEGMENTS = 1024, 64  # samples of a segment, until that makes too many
 
 
@@ -50,14 +53,28 @@ def segments(offset: np.ndarray, trained: int) -> tuple[np.ndarray, int]:
 
     No run holds rays of both kinds. What is cut where depends on the rays alone, not on the number of threads.
     """
-    rays = len(offset) - 1
+    cuts, counts = np.empty(2 * MOST_SEGMENTS + 3, np.int64), np.zeros(2, np.int64)
     size = max(SEGMENT, -(-int(offset[-1]) // MOST_SEGMENTS))
-    cuts, learning = [0], 0
-    for begin, end in ((0, trained), (trained, rays)):
-        if begin < end:
-            goals = np.arange(offset[begin] + size, offset[end], size)
-            inside = np.unique(np.searchsorted(offset[begin:end], goals)) + begin
-            cuts += [int(cut) for cut in inside if begin < cut < end] + [end]
-        if end == trained:
-            learning = len(cuts) - 1
-    return np.array(cuts, np.int64), learning
+    _cut(offset, trained, size, cuts, counts)
+    learning, of_all = counts.tolist()
+    return cuts[: of_all + 1], learning
+
+
+@njit(**KERNEL)
+def _cut(offset, trained, size, cuts, counts):
+    """Fill `cuts` from its start, and counts [2] with how many segments are trained, and of all."""
+    cuts[0] = 0
+    for kind in range(2):
+        begin, end = (0, trained) if kind == 0 else (trained, offset.shape[0] - 1)
+        if kind == 1:
+            counts[1] = counts[0]
+        if begin >= end:
+            continue
+        goal = offset[begin] + size
+        for r in range(begin + 1, end):
+            if goal < offset[end] and offset[r] >= goal:
+                counts[kind] += 1
+                cuts[counts[kind]] = r
+                goal += (offset[r] - goal) // size * size + size
+        counts[kind] += 1
+        cuts[counts[kind]] = end

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from biresnerf.field.numba_kernels import njit
+from biresnerf.field.numba_kernels import njit, prange
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def draw_pixels(where, share, order, training, chances, sizes, offsets, pixels, image, xy, sharp, weight):
     """Fill image [rays], xy [rays, 2], sharp [rays, 3] and weight [rays] from random `where` [rays], `share` [rays, 2].
 
@@ -16,7 +16,7 @@ def draw_pixels(where, share, order, training, chances, sizes, offsets, pixels, 
     run, begin, ends, counted, first = chances
     rays, views, trained = len(where), len(order), 0
     each = np.float32(views / max(1, rays))
-    for r in range(rays):
+    for r in prange(rays):
         place = min(np.int64((np.float32(r) + where[r]) * each), views - 1)
         trained += place < training
         i = order[place]
