@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
 from typing import TypeVar
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +17,7 @@ from biresnerf.refinement.adjustment.kernels.patches import (
     patch_system,
     settle_scales,
 )
+from biresnerf.refinement.adjustment.solver.in_parts import in_parts
 from biresnerf.refinement.adjustment.solver.term import Linearised
 
 Array = NDArray[np.float64]
@@ -142,12 +140,7 @@ class PatchTerm:
         self, kernel: Callable[[tuple[slice, Seen]], Result], cameras: Cameras, scales: Array
     ) -> list[Result]:
         """What a kernel makes of the patches, a part of them on each of the threads."""
-        workers = numba.get_num_threads()
-        bounds = np.linspace(0, len(self.patches), workers + 1).astype(int)
-        parts = [slice(*ends) for ends in pairwise(bounds)]
-        seen = [self._seen(cameras, scales, part) for part in parts]
-        with ThreadPoolExecutor(workers) as threads:
-            return list(threads.map(kernel, zip(parts, seen, strict=True)))
+        return in_parts(lambda part: kernel((part, self._seen(cameras, scales, part))), len(self.patches))
 
     def _seen(self, cameras: Cameras, scales: Array, taken: slice) -> Seen:
         patches = self.patches

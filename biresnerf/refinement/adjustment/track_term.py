@@ -16,6 +16,7 @@ from biresnerf.refinement.adjustment.kernels.tracks import (
     track_errors,
     track_system,
 )
+from biresnerf.refinement.adjustment.solver.in_parts import in_parts
 from biresnerf.refinement.adjustment.solver.term import Linearised
 from biresnerf.refinement.adjustment.tangent_views import TangentViews
 
@@ -82,7 +83,12 @@ class TrackTerm:
 
     def settle(self, cameras: Cameras) -> None:
         """Points to where they fit best for cameras that stay."""
-        settle_points(*self._seen(cameras, self.unknowns), self.noise_px, ROBUST_SCALE, SETTLING)
+        in_parts(
+            lambda part: settle_points(
+                *self._seen(cameras, self.unknowns, part), self.noise_px, ROBUST_SCALE, SETTLING
+            ),
+            len(self.unknowns),
+        )
 
     def _measured_noise(self, cameras: Cameras) -> float:
         """From the median residual; points and cameras have taken their share of the degrees of freedom."""
@@ -99,20 +105,35 @@ class TrackTerm:
 
     def linearise(self, cameras: Cameras, damping: float) -> Linearised:
         size, rows = cameras.unknowns, cameras.rows(self.image)
-        system, right = np.zeros((size, size)), np.zeros(size)
-        seen = self._seen(cameras, self.unknowns)
-        back = track_system(*seen, rows, self.noise_px, ROBUST_SCALE, damping, system, right)
-        return Linearised(system, right, (*back, rows))
+        mixed = np.zeros((*rows.shape, 3))
+
+        def linearised(points: slice) -> tuple[Array, Array, tuple[Array, Array]]:
+            system, right = np.zeros((size, size)), np.zeros(size)
+            seen = self._seen(cameras, self.unknowns, points)
+            back = track_system(*seen, rows, self.noise_px, ROBUST_SCALE, damping, system, right, mixed)
+            return system, right, back
+
+        parts = in_parts(linearised, len(self.unknowns))
+        inverses, gradients = (
+            np.concatenate(each) for each in zip(*(part[2] for part in parts), strict=True)
+        )
+        system, right = (np.sum([part[k] for part in parts], axis=0) for k in (0, 1))
+        return Linearised(system, right, (inverses, gradients, mixed, rows))
 
     def stepped(self, linearised: Linearised, motion: Array) -> Array:
         inverses, gradients, mixed, rows = linearised.back
-        force = gradients.copy()
-        np.add.at(force, self.point, np.einsum("mab,ma->mb", mixed, motion[rows]))
+        moved = np.einsum("mab,ma->mb", mixed, motion[rows])
+        count = len(self.unknowns)
+        force = gradients + np.stack([np.bincount(self.point, one, count) for one in moved.T], 1)
         return self.unknowns - np.einsum("pab,pb->pa", inverses, force)
 
-    def _seen(self, cameras: Cameras, points: Array) -> tuple[NDArray[np.generic], ...]:
+    def _seen(
+        self, cameras: Cameras, points: Array, taken: slice = slice(None)
+    ) -> tuple[NDArray[np.generic], ...]:
+        """What all kernels read, of all points [p, 3] or of a part of them."""
+        start = self.start if taken == slice(None) else self.start[taken.start : taken.stop + 1]
         lens = cameras.lens_rows(self.lens)
         if self._views is None:
-            return cameras.rotation, cameras.centre, lens, points, self.start, self.image, self.xy
+            return cameras.rotation, cameras.centre, lens, points[taken], start, self.image, self.xy
         rotation, centre, lens, view = self._views.seen(cameras, lens)
-        return rotation, centre, lens, points, self.start, view, self._views.xy
+        return rotation, centre, lens, points[taken], start, view, self._views.xy

@@ -84,7 +84,9 @@ def choose_poses(
     best = results.get(chosen.name) or next(iter(results.values()), None)
     kept = given_focals(scene.dataset, optimiser.options.refine_intrinsics)
     optimiser.lenses.certainty = focal_certainty(
-        best, split.fitted, contradicted_focals(refined, split.fitted, split.left_out, prior, noise, kept)
+        best,
+        split.fitted,
+        contradicted_focals(refined, split.fitted, split.left_out, prior, noise, kept, by_tracks),
     )
     return chosen, Finish(choice.reports, fit_of(candidates, results, evidence), given)
 

@@ -92,16 +92,21 @@ def contradicted_focals(
     prior: PosePrior,
     noise: NoiseLevels,
     kept: Lenses,
+    by_tracks: Adjustment | None,
 ) -> list[FocalCertainty | None]:
     """What tracks say of focal lengths that are `kept` as they were given, by letting them go; None of the others.
 
     They are contradicted where tracks that were left out agree.
+
+    Args:
+        by_tracks: the poses adjusted to the same tracks.
     """
     said: list[FocalCertainty | None] = [None] * len(kept.deviation)
     if fitted.tracks is None or left_out.tracks is None or not kept.free.any():
         return said
+    held = by_tracks if fitted.lenses is None else None
     fitted, left_out = replace(fitted, patches=None, lenses=None), replace(left_out, patches=None)
-    held = adjust_poses(world_from_cam, fitted, prior)
+    held = held or adjust_poses(world_from_cam, fitted, prior)
     freed = adjust_poses(held.world_from_cam, replace(fitted, lenses=kept), prior)
     if freed.lenses is None:
         return said

@@ -187,18 +187,20 @@ def eliminate_point(rows, first, last, blocks, forces, mixed, inverse, gradient,
 
 
 @njit(**KERNEL)
-def track_system(rotation, centre, lens, xyz, start, image, xy, rows, sigma, scale, damping, system, right):
+def track_system(
+    rotation, centre, lens, xyz, start, image, xy, rows, sigma, scale, damping, system, right, mixed
+):  # fmt: skip
     """Add the normal equations without the points to system [u, u] and right [u], which is half the gradient.
 
     Args:
         rows: [m, 6 or 9], where the unknowns of each observation's camera, and those of its lens, are among all u.
+        mixed: zero; gets the mixed block [m, 6 or 9, 3] of each observation of these points.
 
-    Returns for each point the inverse of its own block and its gradient, and the mixed block of each observation.
+    Returns for each point the inverse of its own block and its gradient.
     A point that its observations do not fix in this precision has a zero inverse, and no say.
     """
     points, width = len(xyz), rows.shape[1]
     inverses, gradients = np.zeros((points, 3, 3)), np.zeros((points, 3))
-    mixed = np.zeros((len(image), width, 3))
     own, jac, camera = np.empty((3, 3)), np.empty((2, 3)), np.empty((2, 9))
     r, v, q = np.empty(2), np.empty(3), np.empty(3)
     s2, iv = scale * scale, 1.0 / (sigma * sigma)
@@ -246,4 +248,4 @@ def track_system(rotation, centre, lens, xyz, start, image, xy, rows, sigma, sca
         eliminate_point(
             rows, first, start[i + 1], blocks, forces, mixed, inverses[i], gradients[i], system, right
         )
-    return inverses, gradients, mixed
+    return inverses, gradients
