@@ -1,5 +1,6 @@
 """Adjusting cameras to tracks: against the truth, autograd and SciPy's least squares."""
 
+import numba
 import numpy as np
 import pytest
 import torch
@@ -34,7 +35,9 @@ def loose(poses):
 @pytest.mark.parametrize(
     "correction", [None, [[0.04, 0.05, -0.02], [-0.02, 0.0, 0.03]]], ids=["held", "free"]
 )
-def test_normal_equations_are_those_of_autograd(rng, correction):
+@pytest.mark.parametrize("threads", [1, 4, 12], ids=lambda n: f"{n}-threads")  # of 9 points
+def test_normal_equations_are_those_of_autograd(rng, correction, threads, monkeypatch):
+    monkeypatch.setattr(numba, "get_num_threads", lambda: threads)
     truth, evidence = scene(rng, cameras=4, points=9, noise_px=2.0)
     cameras = Cameras.of(disturbed(truth, rng, 0.01, 0.05), correction and two_lenses(correction))
     term = TrackTerm(evidence.tracks, evidence.intrinsics, cameras, noise_px=1.5)
