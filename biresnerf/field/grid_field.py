@@ -105,15 +105,24 @@ class GridField(RadianceField):
 
     def step(self, rates: FieldRates) -> None:
         """One Adam step from the gradients of the last backward."""
-        self.steps["pose"] += 1
-        self._update_table("pose", np.full(self.shape.pose_grid.levels, rates.pose, np.float32))
+        for name in self.modules:
+            self.steps[name] += 1
+            self._update_table(name, self._level_rates(name, rates))
+        self._move_weights(rates)
+
+    def _level_rates(self, name: str, rates: FieldRates) -> np.ndarray:
+        """The rate float32 [levels] of each level of a module."""
+        if name == "pose":
+            return np.full(self.shape.pose_grid.levels, rates.pose, np.float32)
+        return np.asarray(rates.reconstruction, np.float32)
+
+    def _move_weights(self, rates: FieldRates) -> None:
+        """Adam on the networks and the reconstruction module's columns; ends with no gradients."""
         if self._mixing is not None and self.networks[0].grad is not None:
             self._first.grad = self.networks[0].grad @ self._mixing.T
         self._networks_adam.step(rates.networks)
         self._mix()
         if self.reconstructing:
-            self.steps["reconstruction"] += 1
-            self._update_table("reconstruction", np.asarray(rates.reconstruction, np.float32))
             self._columns_adam.step(rates.reconstruction_columns)
         self.discard_gradients()
 

@@ -8,18 +8,29 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from biresnerf.errors import InputError
 from biresnerf.field.cuda import plans
-from biresnerf.field.cuda.launches import interpreted
+from biresnerf.field.cuda.launches import refuse_the_wrong_mode
+from biresnerf.field.cuda.render_rays import RenderRays
 from biresnerf.field.cuda.sample_count import SampleCount
 from biresnerf.field.cuda.workspace import Capacity, Workspace
 from biresnerf.field.grid_field import BETA1, BETA2, GridField
-from biresnerf.field.radiance_field import FieldShape, Marching, Merging, PositionGradient, Rays, Rendering
+from biresnerf.field.radiance_field import (
+    FieldRates,
+    FieldShape,
+    Marching,
+    Merging,
+    PositionGradient,
+    Rays,
+    RecordableField,
+    Rendering,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -30,7 +41,7 @@ BOX_DIAGONAL = 2 * math.sqrt(3)
 RESULTS = ("ray_colour", "opacity", "depth")
 
 
-class CudaField(GridField):
+class CudaField(GridField, RecordableField):
     """Backend `cuda`.
 
     Args:
@@ -45,10 +56,11 @@ class CudaField(GridField):
     def __init__(
         self, shape: FieldShape, seed: int, device: torch.device, samples: int = SAMPLES_LEAST
     ) -> None:
-        _refuse_the_wrong_mode(device)
+        refuse_the_wrong_mode(device)
         super().__init__(shape, seed, device)
         self._samples = self._samples_least = samples
         self._workspace: Workspace | None = None
+        self.place = 0
         self._sample_count = SampleCount(device)
         self._forward_number = 0  # of the forward pass whose samples the buffers hold
         self._pending: int | None = None  # the forward pass whose gradients wait for `step`
@@ -64,14 +76,49 @@ class CudaField(GridField):
     def _drop_workspace(self) -> None:
         self._workspace, self._pending = None, None
 
+    @property
+    def recordable(self) -> bool:  # type: ignore[override]
+        return not self.shape.broadcast  # whose levels are mixed anew in each step
+
+    def prepare(
+        self, rays: int, trained: int, marching: Marching, gradient: PositionGradient, rates: FieldRates
+    ) -> int | None:
+        samples = self._foreseen(rays, marching)
+        if samples is not None:
+            of_tables: dict[str, float | Sequence[float]] = {}
+            for name in self.modules:
+                of_tables |= self._rates(name, self._level_rates(name, rates), self.steps[name] + 1)
+            self._begin(_Pass(rays, trained, marching, gradient, samples), of_tables)
+        return samples
+
+    def step_prepared(self, rates: FieldRates) -> None:
+        for name in self.modules:
+            self._launch_update(name)
+        self._move_weights(rates)
+
+    def finish(self) -> None:
+        for name in self.modules:
+            self.steps[name] += 1
+        self._note()
+
     def render(self, rays: Rays, marching: Marching, gradient: PositionGradient) -> Rendering:
         moving = rays.origin.requires_grad or rays.direction.requires_grad
-        if torch.is_grad_enabled() and (moving or rays.trained):
-            colour, opacity, depth, samples = _RenderRays.apply(
-                rays.origin, rays.direction, self.networks[0], self, rays, marching, gradient
-            )
-            return Rendering(colour, opacity, depth, int(samples))
-        return self._view(rays, marching, gradient)
+        if not (torch.is_grad_enabled() and (moving or rays.trained)):
+            return self._view(rays, marching, gradient)
+        count = len(rays.origin)
+        samples = self._foreseen(count, marching)
+        if samples is None:
+            samples = self._counted(rays, marching, gradient)
+        self._begin(_Pass(count, rays.trained, marching, gradient, samples))
+        rendering = self.render_prepared(rays)
+        self._note()
+        return rendering
+
+    def render_prepared(self, rays: Rays) -> Rendering:
+        samples = self._pass.samples
+        return Rendering(
+            *RenderRays.apply(rays.origin, rays.direction, self.networks[0], self, rays), samples
+        )
 
     def density(self, position: Tensor) -> Tensor:
         return self._density(position, None, whole=True)
@@ -106,8 +153,8 @@ class CudaField(GridField):
                 rays.origin[taken], rays.direction[taken], rays.background[taken], rays.jitter[taken], trained=0
             )  # fmt: skip
             w = self._reserve(len(part.origin), 1, marching.most, side)
-            self._write(w, part, marching, gradient)
-            w.record()
+            self._begin(_Pass(len(part.origin), 0, marching, gradient, 0))
+            self._write_rays(w, part)
             w.plan(plans.viewing, marching.merging is not None).run()
             n = len(part.origin)
             parts.append([w.buffers[name][:n].clone() for name in RESULTS])
@@ -115,33 +162,45 @@ class CudaField(GridField):
         colour, opacity, depth = (torch.cat(tensors) for tensors in zip(*parts, strict=True))
         return Rendering(colour, opacity, depth, int(total))
 
-    def run_forward(
-        self, rays: Rays, marching: Marching, gradient: PositionGradient
-    ) -> tuple[Tensor, Tensor, Tensor, int, int]:
-        """Colour, opacity and depth for a backward pass to follow; samples; the number of this pass."""
-        count, interval, side = len(rays.origin), marching.step, marching.occupied.shape[0]
-        w = self._reserve(count, 1, marching.most, side)
+    def _foreseen(self, count: int, marching: Marching) -> int | None:
+        """Samples to expect of so many rays; None where none were counted yet, or so many might not fit."""
+        w = self._reserve(count, 1, marching.most, marching.occupied.shape[0])
         needed = self._sample_count.latest()
         if needed > w.capacity.samples:
             logger.warning(
                 "a step needed %d samples of %d: its last rays were left out", needed, w.capacity.samples
             )
-        samples = self._sample_count.expected(count, interval)
+        samples = self._sample_count.expected(count, marching.step)
         certain = count * self._most_of_a_ray(marching) <= w.capacity.samples
-        if samples is None or not (certain or samples * MARGIN <= w.capacity.samples):
-            # No count is known, or far more samples are expected: only here the host waits for the device.
-            self._write(w, rays, marching, gradient)
-            w.plan(plans.marching).run()
-            samples = int(w.buffers["marched"])
-            if samples * MARGIN > w.capacity.samples:
-                del w  # frees its memory before the larger one takes its own
-                w = self._reserve(count, int(samples * GROWTH), marching.most, side)
-        self._write(w, rays, marching, gradient)
-        w.record()
-        w.plan(plans.forward, marching.merging is not None).run()
-        self._sample_count.note(w.buffers["marched"], count, interval)
+        fits = samples is not None and (certain or samples * MARGIN <= w.capacity.samples)
+        return samples if fits else None
+
+    def _counted(self, rays: Rays, marching: Marching, gradient: PositionGradient) -> int:
+        """Samples of rays, for which buffers grow. Only here a step of the optimisation waits for the device."""
+        count, side = len(rays.origin), marching.occupied.shape[0]
+        w = self._reserve(count, 1, marching.most, side)
+        self._begin(_Pass(count, rays.trained, marching, gradient, 0))
+        self._write_rays(w, rays)
+        w.plan(plans.marching).run()
+        samples = int(w.buffers["marched"])
+        if samples * MARGIN > w.capacity.samples:
+            del w  # frees its memory before the larger one takes its own
+            self._reserve(count, int(samples * GROWTH), marching.most, side)
+        return samples
+
+    def run_forward(self, rays: Rays) -> tuple[Tensor, Tensor, Tensor, int]:
+        """Colour, opacity and depth for a backward pass to follow; the number of this pass."""
+        w, count = self._workspace, len(rays.origin)
+        assert w is not None
+        self._write_rays(w, rays)
+        w.plan(plans.forward, self._pass.marching.merging is not None).run()
         colour, opacity, depth = (w.buffers[name][:count].clone() for name in RESULTS)
-        return colour, opacity, depth, samples, self._forward_number
+        return colour, opacity, depth, self._forward_number
+
+    def _note(self) -> None:
+        """Request the count of the last pass."""
+        assert self._workspace is not None
+        self._sample_count.note(self._workspace.buffers["marched"], self._pass.rays, self._pass.marching.step)
 
     def run_backward(
         self, number: int, count: int, trained: int, g_colour: Tensor, g_opacity: Tensor
@@ -161,16 +220,22 @@ class CudaField(GridField):
         return w.buffers["g_origin"][:count].clone(), w.buffers["g_direction"][:count].clone()
 
     def _update_table(self, name: str, rates: np.ndarray) -> None:
+        if self._pending is not None and self._workspace is not None:
+            self._workspace.write_controls(self._rates(name, rates, self.steps[name]))
+        self._launch_update(name)
+
+    @staticmethod
+    def _rates(name: str, rates: np.ndarray, step: int) -> dict[str, float | Sequence[float]]:
+        """The numbers of Adam's step on a table."""
+        corrections = (1 / (1 - BETA1**step), 1 / math.sqrt(1 - BETA2**step))
+        return {f"{name}_rates": rates.tolist(), f"{name}_corrections": corrections}
+
+    def _launch_update(self, name: str) -> None:
         w = self._workspace
         if self._pending is None:
             return
         if w is None or self._pending != self._forward_number:
             raise RuntimeError("the field was used for something else between backward and step")
-        step = self.steps[name]
-        table = w.tables[name]
-        table["rates"].copy_(torch.from_numpy(rates), non_blocking=True)
-        corrections = torch.tensor([1 / (1 - BETA1**step), 1 / math.sqrt(1 - BETA2**step)])
-        table["corrections"].copy_(corrections, non_blocking=True)
         w.plan(plans.update, name).run()
 
     def discard_gradients(self) -> None:
@@ -199,54 +264,40 @@ class CudaField(GridField):
         held = None
         self._workspace = None  # frees its memory before the larger one takes its own
         self._forward_number += 1
+        self.place += 1
         self._workspace = Workspace(self, Capacity(rays, self._samples, max(before.most, most), side))
         return self._workspace
 
-    def _write(self, w: Workspace, rays: Rays, marching: Marching, gradient: PositionGradient) -> None:
-        """Write the inputs of a pass into the buffers."""
+    def _begin(self, of: _Pass, others: Mapping[str, float | Sequence[float]] | None = None) -> None:
+        """Write the numbers of a pass, and others, to the device."""
+        w = self._workspace
+        assert w is not None
         self._forward_number += 1
-        count = len(rays.origin)
-        for name in ("origin", "direction", "background", "jitter"):
-            w.buffers[name][:count].copy_(getattr(rays, name).detach())
+        self._pass, marching, gradient = of, of.marching, of.gradient
         w.buffers["occupied"].copy_(marching.occupied)
         merging = marching.merging or Merging(0.0, 0)
         values = {
-            "ray_count": count, "trained_rays": rays.trained,
+            "ray_count": of.rays, "trained_rays": of.trained,
             "interval": marching.step, "near": marching.near, "far": marching.far,
             "pose_smoothing": gradient.pose_smoothing, "pose_share": 1.0,
             "reconstruction_smoothing": gradient.reconstruction_smoothing,
             "reconstruction_share": gradient.reconstruction_share,
             "merged_light": merging.light, "merged_most": merging.most,
         }  # fmt: skip
-        w.write_controls(values)
+        w.write_controls({**values, **(others or {})})
+        w.record()
+
+    def _write_rays(self, w: Workspace, rays: Rays) -> None:
+        for name in ("origin", "direction", "background", "jitter"):
+            w.buffers[name][: len(rays.origin)].copy_(getattr(rays, name).detach())
 
 
-def _refuse_the_wrong_mode(device: torch.device) -> None:
-    """The interpreter is for tests on machines without CUDA: it may neither slow a GPU down nor be missing here."""
-    if interpreted() == (device.type == "cuda"):
-        raise InputError(
-            "device_unavailable",
-            f"Triton's interpreter is {'on' if interpreted() else 'off'}: the kernels cannot run on {device}.",
-            where="device",
-            hint="Unset TRITON_INTERPRET, and use --device cpu where there is no CUDA.",
-        )
+@dataclass(frozen=True)
+class _Pass:
+    """What is rendered at once: rays, those of them that teach the field, and the samples to expect."""
 
-
-class _RenderRays(torch.autograd.Function):
-    """Ties the kernels to autograd at the rays, so that poses are optimised like any other torch parameter.
-
-    One of the field's weights is an input so that the backward pass is reached where poses stand still.
-    """
-
-    @staticmethod
-    def forward(ctx, origin, direction, _weight, field: CudaField, rays: Rays, marching, gradient):
-        colour, opacity, depth, samples, number = field.run_forward(rays, marching, gradient)
-        ctx.kept = (field, number, len(origin), rays.trained)
-        ctx.mark_non_differentiable(depth)
-        return colour, opacity, depth, samples
-
-    @staticmethod
-    def backward(ctx, g_colour, g_opacity, _g_depth, _g_samples):
-        field, number, count, trained = ctx.kept
-        g_origin, g_direction = field.run_backward(number, count, trained, g_colour, g_opacity)
-        return g_origin, g_direction, *(None,) * 5
+    rays: int
+    trained: int
+    marching: Marching
+    gradient: PositionGradient
+    samples: int

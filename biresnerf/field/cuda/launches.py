@@ -14,12 +14,24 @@ from typing import Any
 import torch
 import triton
 
+from biresnerf.errors import InputError
 from biresnerf.field.cuda.rays import march
 
 
 def interpreted() -> bool:
     """Whether Triton's interpreter runs the kernels: TRITON_INTERPRET was set when they were loaded (tests only)."""
     return not isinstance(march, triton.JITFunction)
+
+
+def refuse_the_wrong_mode(device: torch.device) -> None:
+    """The interpreter is for tests on machines without CUDA: it may neither slow a GPU down nor be missing here."""
+    if interpreted() == (device.type == "cuda"):
+        raise InputError(
+            "device_unavailable",
+            f"Triton's interpreter is {'on' if interpreted() else 'off'}: the kernels cannot run on {device}.",
+            where="device",
+            hint="Unset TRITON_INTERPRET, and use --device cpu where there is no CUDA.",
+        )
 
 
 def block(size: int) -> int:
@@ -57,7 +69,8 @@ class Plan:
         self._ran = False
 
     def run(self) -> None:
-        if self._graph is not None:
+        # A graph of the whole step cannot hold another one: it records the launches themselves.
+        if self._graph is not None and not torch.cuda.is_current_stream_capturing():
             self._graph.replay()
             return
         for launch in self.launches:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,6 +21,8 @@ CONTROLS = (
     "merged_light", "merged_most",
 )  # fmt: skip
 PROGRAMS_ELSEWHERE = 3
+
+Controls = Mapping[str, float | Sequence[float]]
 
 
 @dataclass(frozen=True)
@@ -52,16 +55,27 @@ class Workspace:
         # In the order in which the two backward kernels sum their gradients.
         self.density_weights = [*field.networks[:2], *columns]
         self.colour_weights = field.networks[2:]
-        self.controls = torch.zeros(len(CONTROLS), device=self.device)
+        sizes = dict.fromkeys(CONTROLS, 1)
+        for name in self.modules:
+            sizes |= {f"{name}_rates": self.grids[name].levels, f"{name}_corrections": 2}
+        ends = np.cumsum([0, *sizes.values()]).tolist()
+        self._places = dict(zip(sizes, map(slice, ends, ends[1:]), strict=True))
+        self._told = [0.0] * ends[-1]  # what the device's memory holds
+        self._controls = torch.zeros(ends[-1], device=self.device)
+        self.controls = {name: self._controls[place] for name, place in self._places.items()}
         self.buffers: dict[str, Tensor] = {
             **self._rays(),
             **self._samples(),
-            **{name: self.controls[i : i + 1] for i, name in enumerate(CONTROLS)},
+            **{name: self.controls[name] for name in CONTROLS},
             **dict(zip(("w1", "w2", "w3", "w4", "w5"), field.networks, strict=True)),
             "columns": field.reconstruction_columns,
         }
         self.tables = {
-            name: _level_buffers(self.grids[name], field.tables[name], field.moments[name])
+            name: {
+                **_level_buffers(self.grids[name], field.tables[name], field.moments[name]),
+                "rates": self.controls[f"{name}_rates"],
+                "corrections": self.controls[f"{name}_corrections"],
+            }
             for name in self.modules
         }
         self._plans: dict[tuple[Any, ...], Plan] = {}
@@ -73,10 +87,12 @@ class Workspace:
             self._plans[key] = Plan(launches(self, *arguments), self.device)
         return self._plans[key]
 
-    def write_controls(self, values: dict[str, float]) -> None:
-        """Set what changes from step to step."""
+    def write_controls(self, values: Controls) -> None:
+        """Set, in one copy, some of what changes from step to step."""
+        for name, value in values.items():
+            self._told[self._places[name]] = value if isinstance(value, Sequence) else [value]
         # Memory that is not pinned is copied aside before the call returns, so the host neither waits nor races.
-        self.controls.copy_(torch.tensor([values[name] for name in CONTROLS]), non_blocking=True)
+        self._controls.copy_(torch.tensor(self._told), non_blocking=True)
 
     def record(self) -> None:
         """Make graphs of all plans that have run."""
@@ -129,7 +145,7 @@ class Workspace:
 
 
 def _level_buffers(grid: GridLevels, table: Tensor, moments: tuple[Tensor, Tensor]) -> dict[str, Tensor]:
-    """A module's table (an entry of two float32 also as one int64), its optimiser state and its geometry."""
+    """A module's table (an entry of two float32 also as one int64), its moments and its geometry."""
 
     def on_device(values: Any, dtype: torch.dtype) -> Tensor:
         return torch.as_tensor(values).to(dtype).to(table.device)
@@ -140,8 +156,6 @@ def _level_buffers(grid: GridLevels, table: Tensor, moments: tuple[Tensor, Tenso
         "gradient": torch.zeros_like(table),
         "moment1": moments[0],
         "moment2": moments[1],
-        "rates": torch.zeros(grid.levels, device=table.device),
-        "corrections": torch.zeros(2, device=table.device),
         "scale": on_device(grid.scale, torch.float32),
         "stride": on_device(grid.stride.astype("int64"), torch.int32),
         "hashed": on_device(grid.hashed, torch.int32),

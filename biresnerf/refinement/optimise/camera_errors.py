@@ -95,6 +95,7 @@ class CameraErrors:
         doubted: mask [n] of cameras that began at a guess and have not yet agreed with the field of the others.
         lost: mask [n] of cameras that stood out for `IN_A_ROW` blocks, and of those in doubt.
         weights: of each camera's rays in the loss [n], None where all weigh the same.
+        sums: of the present block [n, 3]: rays, squared errors, opacities.
     """
 
     def __init__(self, images: ImageSet, held_out: list[int], device: torch.device) -> None:
@@ -112,7 +113,7 @@ class CameraErrors:
         self.weights: Tensor | None = None
         self.doubted = torch.zeros(count, dtype=torch.bool, device=device)
         self._stood_out = torch.zeros(count, dtype=torch.int64, device=device)
-        self._sums = torch.zeros(count, 3, device=device)  # rays, squared errors, opacities
+        self.sums = torch.zeros(count, 3, device=device)
 
     @property
     def lost(self) -> Tensor:
@@ -131,12 +132,14 @@ class CameraErrors:
 
     def _weigh(self) -> None:
         """Weigh lost cameras less: they must not fog the field where they wrongly stand."""
-        self.weights = None
+        before, self.weights = self.weights, None
         if bool(self.lost.any()):
             known = self.errors.isfinite()
             weights = torch.where(known, 1 / self.relative.clamp(min=1), torch.ones_like(self.errors))
             weights = torch.where(self.doubted, weights.clamp(max=DOUBTED_WEIGHT), weights)
-            self.weights = torch.where(self.lost, weights, torch.ones_like(weights))
+            weights = torch.where(self.lost, weights, torch.ones_like(weights))
+            # In its place, as recorded steps read it.
+            self.weights = weights if before is None else before.copy_(weights)
 
     def doubt(self, cameras: np.ndarray) -> None:
         """Mark cameras (mask [n]) with guessed poses: they begin with little weight, and as suspects."""
@@ -150,11 +153,11 @@ class CameraErrors:
 
     def add(self, image: Tensor, colour: Tensor, target: Tensor, opacity: Tensor, weight: Tensor) -> None:
         """One batch: image, opacity and weight [rays], rendered and target colours [rays, 3]."""
-        if self._sums.device.type != "cpu":
+        if self.sums.device.type != "cpu":
             self.defined_add(image, colour, target, opacity, weight)
             return
         shown, wanted = colour.contiguous().numpy(), target.contiguous().numpy()
-        add_errors(image.numpy(), shown, wanted, opacity.numpy(), weight.numpy(), self._sums.numpy())
+        add_errors(image.numpy(), shown, wanted, opacity.numpy(), weight.numpy(), self.sums.numpy())
 
     def defined_add(
         self, image: Tensor, colour: Tensor, target: Tensor, opacity: Tensor, weight: Tensor
@@ -162,11 +165,11 @@ class CameraErrors:
         """The same by torch's operations, on any device."""
         squared = ((colour - target) ** 2).mean(1)
         values = torch.stack([torch.ones_like(squared), squared, opacity], 1)
-        self._sums.index_add_(0, image, values * weight[:, None])
+        self.sums.index_add_(0, image, values * weight[:, None])
 
     def close_block(self) -> None:
         """Add the block's errors to the moving average and find the cameras that stand out."""
-        rays, squared, opacity = self._sums.unbind(1)
+        rays, squared, opacity = self.sums.unbind(1)
         measured = rays > 0
         block = squared / rays.clamp(min=1) / self.shares
         smoothed = torch.where(self.errors.isfinite(), self.errors + SMOOTHING * (block - self.errors), block)
@@ -177,7 +180,7 @@ class CameraErrors:
         if self.bounded:
             out |= measured & (opacity / rays.clamp(min=1) < COVERAGE * self.shares)
         self._stood_out = torch.where(out, self._stood_out + 1, torch.zeros_like(self._stood_out))
-        self._sums.zero_()
+        self.sums.zero_()
         self._weigh()
 
     def _outliers(self, deviations: float, untrained: float) -> Tensor:
@@ -191,14 +194,14 @@ class CameraErrors:
         self.errors[camera] = torch.inf
         self._stood_out[camera] = 0
         self.doubted[camera] = False
-        self._sums[camera] = 0
+        self.sums[camera] = 0
         self._weigh()
 
     def state(self) -> dict[str, Tensor]:
         return {
             "errors": self.errors,
             "stood_out": self._stood_out,
-            "sums": self._sums.T,
+            "sums": self.sums.T,
             "doubted": self.doubted,
         }
 

@@ -19,11 +19,13 @@ from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refinement.optimise.async_metrics import AsyncMetrics, StepResult
 from biresnerf.refinement.optimise.camera_errors import CameraErrors
-from biresnerf.refinement.optimise.cast_rays import cast_rays, turned, viewing_directions
+from biresnerf.refinement.optimise.cast_rays import turned, viewing_directions
+from biresnerf.refinement.optimise.joint_step import joint_step, step_numbers
 from biresnerf.refinement.optimise.methods import find_method
 from biresnerf.refinement.optimise.optimiser_state import Part, StepState, load_state_of, state_of
-from biresnerf.refinement.optimise.photo_sampler import PhotoSampler, PixelBatch
+from biresnerf.refinement.optimise.photo_sampler import PhotoSampler
 from biresnerf.refinement.optimise.pose_hypotheses import photo_distances
+from biresnerf.refinement.optimise.step_graphs import StepGraphs
 from biresnerf.refinement.parameters.exposure import Exposure
 from biresnerf.refinement.parameters.intrinsics_parameters import IntrinsicsParameters
 from biresnerf.refinement.parameters.pose_parameters import PoseParameters
@@ -97,6 +99,7 @@ class JointOptimiser:
         self.mobility[:, torch.from_numpy(self.bodies.fixed).to(device)] = 0.0
         guess = self.schedule.samples(0, None) // (self.field.stratified or FIRST_SAMPLES)
         self.rays = max(self.method.rays_least, guess)
+        self.graphs = StepGraphs(self) if StepGraphs.can_take(self) else None
 
     @cached_property
     def photo_distances(self) -> NDArray[np.float32]:
@@ -152,6 +155,12 @@ class JointOptimiser:
         jitter: bool,
     ) -> Rendering:
         """Render rays over the scene's background; `jitter` randomises where sampling starts."""
+        return self.field.render(
+            self.over_background(origin, direction, trained, jitter=jitter), self.marching(interval), gradient
+        )
+
+    def over_background(self, origin: Tensor, direction: Tensor, trained: int, *, jitter: bool) -> Rays:
+        """Rays before the scene's background, the first `trained` of which teach the field."""
         count = len(origin)
         shape = (count,) if self.field.stratified is None else (count, self.field.stratified)
         start = (
@@ -160,8 +169,7 @@ class JointOptimiser:
             else torch.full(shape, 0.5, device=self.device)
         )
         background = self.background.expand(count, 3).contiguous()
-        rays = Rays(origin, direction, background, start, trained)
-        return self.field.render(rays, self.marching(interval), gradient)
+        return Rays(origin, direction, background, start, trained)
 
     def step(self) -> StepResult:
         """One step of the joint optimisation."""
@@ -169,48 +177,12 @@ class JointOptimiser:
         self.field.reach(t / schedule.steps)
         if t % OCCUPANCY_PERIOD == 0 and self.method.pruned:
             self._update_occupancy(t)
-        batch = self.sampler.draw(
-            self.rays, schedule.blur(t, self.switch, self.sampler.long_side), self.draws
-        )
-        rate = self.pose_rate()
-        held = self.poses_held or not self.lenses.moving
-        lens_rate = 0.0 if held else schedule.lens_rate(t, self.switch)
-        matrices, lenses = self.poses.matrices(), self.intrinsics
-        if rate == 0:
-            matrices = matrices.detach()
-        if lens_rate > 0:
-            matrices, lenses = self.lenses.with_gradient(matrices)
-        in_cam = viewing_directions(self.directions, lenses, batch.image, batch.xy)
-        origin, direction = cast_rays(matrices, batch.image, in_cam)
-        rendering = self.render(
-            origin, direction, batch.trained, schedule.interval(t, self.switch),
-            schedule.position_gradient(t, self.switch), jitter=True,
-        )  # fmt: skip
-        colour = self.exposure.shown(rendering, batch.image)
-        loss = self._loss(self.exposure.forgiven(colour, batch.target), batch)
-        loss.backward()
-        rates = schedule.field_rates(t, self.switch)
-        self.field.step(rates)
-        self.exposure.step(rates.networks)
-        if rate > 0:
-            mobility = self.mobility[0 if self.switch is None else 1]
-            self.poses.step(rate, mobility, field_rate=rates.networks)
-            if lens_rate > 0:
-                self.poses.dolly(self.lenses.step(lens_rate, focal=schedule.focal_moves(self.switch)))
+        told = step_numbers(self)
+        done = joint_step(self, told, self.field) if self.graphs is None else self.graphs.step(told)
         self.step_index += 1
-        self._adapt_rays(rendering.samples, int(self.batch_share * schedule.samples(t, self.switch)))
-        shown = colour.detach().clamp(max=1)
-        self.camera_errors.add(batch.image, shown, batch.target, rendering.opacity.detach(), batch.weight)
-        error = ((shown - batch.sharp) ** 2 * batch.weight[:, None])[: batch.trained].mean()
-        # A pose that is not finite sees nothing, so the loss stays finite.
-        loss_value, error_value = self.metrics.read(loss.detach() + self.poses.zero_if_finite(), error)
-        return StepResult(loss_value, error_value, len(origin), rendering.samples)
-
-    def _loss(self, colour: Tensor, batch: PixelBatch) -> Tensor:
-        weight, of_camera = batch.weight, self.camera_errors.weights
-        if of_camera is not None and self.method.robust_extensions:
-            weight = weight * of_camera[batch.image]
-        return (self.method.loss(colour, batch.target) * weight[:, None]).mean()
+        self._adapt_rays(done.samples, int(self.batch_share * schedule.samples(t, self.switch)))
+        loss, error = self.metrics.read(done.loss, done.error)
+        return StepResult(loss, error, told.rays, done.samples)
 
     def pose_rate(self) -> float:
         """Learning rate of the poses at this step."""
@@ -254,6 +226,8 @@ class JointOptimiser:
         wanted = self.rays * budget / max(1, samples)
         wanted = min(max(wanted, self.rays / 1.5), self.rays * 1.5)
         self.rays = int(min(max(wanted, self.method.rays_least), RAYS_MOST))
+        if self.graphs is not None:
+            self.rays = self.graphs.rays_of_size(self.rays)
 
     def coarse_state(self) -> dict[str, Tensor]:
         """The tensors of stage 1: all but the reconstruction module, which has not moved."""

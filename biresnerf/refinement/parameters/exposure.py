@@ -108,15 +108,18 @@ class Exposure:
         return torch.where((target >= SATURATED) & (colour > target), target, colour)
 
     @torch.no_grad()
-    def step(self, rate: float) -> None:
+    def step(self, rate: float | Tensor) -> None:
         """One step of Adam from the gradients of the last backward; `rate` is the networks'."""
         if self.log_gain.grad is None:
             return
         self.log_gain.grad += PRIOR / len(self.log_gain) * self.log_gain
         self._adam.step(RATE_SHARE * rate)
-        self._adam.zero_grad()
+        self.forget_gradients()
         mean = (self.log_gain * self._training).sum(0) / self._training.sum()
         self.log_gain.sub_(mean).clamp_(-math.log(MOST), math.log(MOST))
+
+    def forget_gradients(self) -> None:
+        self._adam.zero_grad()
 
     @torch.no_grad()
     def forget(self, camera: int) -> None:

@@ -120,6 +120,7 @@ class IntrinsicsParameters:
         self.increments = torch.zeros(len(cameras), COLUMNS, dtype=torch.float64, device=device)
         self.increments.requires_grad_()
         self._adam = Adam([self.increments], betas=BETAS, eps=EPSILON)
+        self._present: Intrinsics | None = None
         self.certainty: tuple[FocalCertainty | None, ...] = (None,) * len(cameras)
         self._show()
 
@@ -131,7 +132,14 @@ class IntrinsicsParameters:
     @property
     def intrinsics(self) -> Intrinsics:
         """Every image's present intrinsics at working size, without gradient."""
+        if self._present is None:
+            with torch.no_grad():
+                self._present = self.differentiable()
         return self._present
+
+    def forget_present(self) -> None:
+        """Compute them again when they are next asked for: increments have moved."""
+        self._present = None
 
     def differentiable(self) -> Intrinsics:
         """The same as a function of the increments."""
@@ -162,7 +170,7 @@ class IntrinsicsParameters:
             self.differentiable()
         )
 
-    def step(self, rate: float, *, focal: bool = True) -> Tensor:
+    def step(self, rate: float | Tensor, *, focal: bool = True) -> Tensor:
         """A step of Adam; returns the log focal length by which each image's camera is to dolly, [images].
 
         Args:
@@ -180,8 +188,7 @@ class IntrinsicsParameters:
 
     @torch.no_grad()
     def _moved(self, before: Tensor) -> Tensor:
-        if self.moving:
-            self._present = self.differentiable()
+        self.forget_present()
         moved = ((self.increments - before) * self.free)[:, FOCAL][self.of_image]
         return moved if self.dollies else torch.zeros_like(moved)
 
@@ -205,7 +212,7 @@ class IntrinsicsParameters:
         groups = zip(self.given.terms, (used[:4], used[4:7], used[7:]), strict=True)
         above, below, tangential = (max(t, int(g.nonzero().max()) + 1 if g.any() else 0) for t, g in groups)
         self.given = replace(self.given, terms=(above, below, tangential))
-        self._present = self.differentiable()
+        self.forget_present()
 
     def forget_gradients(self) -> None:
         self._adam.zero_grad()

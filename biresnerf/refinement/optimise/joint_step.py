@@ -1,0 +1,120 @@
+"""What a step of the joint optimisation is told, and what it computes from that."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+from torch import Tensor
+
+from biresnerf.field.radiance_field import FieldRates, Marching, PositionGradient, Rays, Rendering
+from biresnerf.refinement.optimise.cast_rays import cast_rays, viewing_directions
+from biresnerf.refinement.optimise.photo_sampler import PixelBatch
+
+if TYPE_CHECKING:
+    from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+
+
+@dataclass(frozen=True)
+class StepNumbers:
+    """All that changes from step to step, besides tensors and random numbers.
+
+    Rates and blur lie in the device's memory where a step is recorded, so that its repetitions have others.
+
+    Attributes:
+        blur: standard deviation (px) of the photos' blur before its random factor; or see
+            `PhotoSampler.draw_recordable`.
+        moves_focal: whether focal lengths move, where lenses do.
+    """
+
+    rays: int
+    marching: Marching
+    gradient: PositionGradient
+    rates: FieldRates
+    blur: float | Tensor | None
+    pose_rate: float | Tensor
+    lens_rate: float | Tensor
+    moves_poses: bool
+    moves_lenses: bool
+    moves_focal: bool
+
+
+@dataclass(frozen=True)
+class StepOutcome:
+    """Loss [] against the (blurred) targets, error [] of training rays against the sharp photos, and samples."""
+
+    loss: Tensor
+    error: Tensor
+    samples: int
+
+
+class SteppedField(Protocol):
+    """What a step asks of a field, see `RadianceField`."""
+
+    def render(self, rays: Rays, marching: Marching, gradient: PositionGradient) -> Rendering: ...
+    def step(self, rates: FieldRates) -> None: ...
+
+
+def step_numbers(optimiser: JointOptimiser) -> StepNumbers:
+    """What the next step is told."""
+    t, switch, schedule = optimiser.step_index, optimiser.switch, optimiser.schedule
+    rate = optimiser.pose_rate()
+    held = optimiser.poses_held or not optimiser.lenses.moving
+    lens_rate = 0.0 if held else schedule.lens_rate(t, switch)
+    return StepNumbers(
+        rays=optimiser.rays,
+        marching=optimiser.marching(schedule.interval(t, switch)),
+        gradient=schedule.position_gradient(t, switch),
+        rates=schedule.field_rates(t, switch),
+        blur=schedule.blur(t, switch, optimiser.sampler.long_side),
+        pose_rate=rate,
+        lens_rate=lens_rate,
+        moves_poses=rate > 0,
+        moves_lenses=lens_rate > 0,
+        moves_focal=schedule.focal_moves(switch),
+    )
+
+
+def joint_step(optimiser: JointOptimiser, told: StepNumbers, field: SteppedField) -> StepOutcome:
+    """Draw pixels, render them, and move field, poses, lenses and exposures by the gradients of the loss.
+
+    Nothing else of the host's may change here: a recorded step is repeated without it.
+    """
+    poses, exposure = optimiser.poses, optimiser.exposure
+    if isinstance(told.blur, float):
+        batch = optimiser.sampler.draw(told.rays, told.blur, optimiser.draws)
+    else:
+        batch = optimiser.sampler.draw_recordable(told.rays, told.blur, optimiser.draws)
+    matrices = poses.matrices()
+    if not told.moves_poses:
+        matrices = matrices.detach()
+    if told.moves_lenses:
+        matrices, lenses = optimiser.lenses.with_gradient(matrices)
+    else:
+        lenses = optimiser.intrinsics
+    in_cam = viewing_directions(optimiser.directions, lenses, batch.image, batch.xy)
+    origin, direction = cast_rays(matrices, batch.image, in_cam)
+    rays = optimiser.over_background(origin, direction, batch.trained, jitter=True)
+    rendering = field.render(rays, told.marching, told.gradient)
+    colour = exposure.shown(rendering, batch.image)
+    loss = _loss(optimiser, exposure.forgiven(colour, batch.target), batch)
+    loss.backward()
+    field.step(told.rates)
+    exposure.step(told.rates.networks)
+    if told.moves_poses:
+        mobility = optimiser.mobility[0 if optimiser.switch is None else 1]
+        poses.step(told.pose_rate, mobility, field_rate=told.rates.networks)
+        if told.moves_lenses:
+            poses.dolly(optimiser.lenses.step(told.lens_rate, focal=told.moves_focal))
+    shown = colour.detach().clamp(max=1)
+    optimiser.camera_errors.add(batch.image, shown, batch.target, rendering.opacity.detach(), batch.weight)
+    error = ((shown - batch.sharp) ** 2 * batch.weight[:, None])[: batch.trained].mean()
+    # A pose that is not finite sees nothing, so the loss stays finite.
+    return StepOutcome(loss.detach() + poses.zero_if_finite(), error, rendering.samples)
+
+
+def _loss(optimiser: JointOptimiser, colour: Tensor, batch: PixelBatch) -> Tensor:
+    weight, of_camera = batch.weight, optimiser.camera_errors.weights
+    if of_camera is not None and optimiser.method.robust_extensions:
+        weight = weight * of_camera[batch.image]
+    return (optimiser.method.loss(colour, batch.target) * weight[:, None]).mean()
