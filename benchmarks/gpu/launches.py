@@ -12,7 +12,7 @@ import copy
 import linecache
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from unittest.mock import patch
@@ -29,6 +29,8 @@ from biresnerf.field.radiance_field import Marching, PositionGradient, Rays, Ren
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.refinement.optimise import cast_rays
 from biresnerf.refinement.optimise.joint_optimiser import OCCUPANCY_PERIOD, JointOptimiser
+from biresnerf.refinement.optimise.joint_step import StepNumbers, StepOutcome
+from biresnerf.refinement.optimise.step_graphs import StepGraphs
 from biresnerf.refinement.parameters import pose_parameters
 
 GPU = torch.device("meta")
@@ -38,6 +40,9 @@ MOVES_NOTHING = {
     "t", "transpose", "unbind", "unsqueeze", "view", "_unsafe_view", "_reshape_alias",
     "empty", "empty_like", "empty_strided", "new_empty", "lift_fresh",
 }  # fmt: skip
+# torch has none for tensors without values. It returns nothing.
+_ADAM = torch.library.Library("aten", "IMPL", "Meta")
+_ADAM.impl("_fused_adam_.tensor_lr", lambda *arguments, **others: None)
 
 
 @dataclass
@@ -76,7 +81,7 @@ class Recorder(TorchDispatchMode):
 class PretendedField:
     """A field of two lines, differentiable in the rays."""
 
-    stratified, unbounded = None, False
+    stratified, unbounded, place = None, False, 0
 
     def reach(self, share: float) -> None:
         pass
@@ -88,8 +93,37 @@ class PretendedField:
     def step(self, rates: object) -> None:
         pass
 
+    def prepare(self, rays: int, *numbers: object) -> int:
+        return 100
+
+    def render_prepared(self, rays: Rays) -> Rendering:
+        return self.render(rays, None, None)
+
+    def step_prepared(self, rates: object) -> None:
+        pass
+
+    def finish(self) -> None:
+        pass
+
+    def discard_gradients(self) -> None:
+        pass
+
     def estimate(self, position: Tensor, count: Tensor) -> Tensor:
         return position.sum(1).abs()
+
+
+class PretendedGraphs(StepGraphs):
+    """Every step operation by operation, or every step as one launch."""
+
+    def __init__(self, optimiser: JointOptimiser, recorder: Recorder) -> None:
+        super().__init__(optimiser, record=lambda work, draws: None, check=tuple)
+        self.replayed, self._recorder = False, recorder
+
+    def _taken(self, told: StepNumbers, work: Callable[[], StepOutcome]) -> StepOutcome:
+        if not self.replayed:
+            return work()
+        self._recorder.trace.launches["graph"] += 1
+        return StepOutcome(torch.empty((), device=GPU), torch.empty((), device=GPU), 0)
 
 
 class PretendedGenerator:
@@ -111,28 +145,30 @@ def pretended_directions(lenses: Intrinsics, image: Tensor, xy: Tensor) -> Tenso
     return torch.cat([xy.double() / lenses.fx[image, None], torch.ones_like(xy[:, :1])], 1)
 
 
-def traced_step(optimiser: JointOptimiser, *, looks_at_cells: bool = False) -> Trace:
+def traced_step(optimiser: JointOptimiser, *, looks_at_cells: bool = False, replayed: bool = False) -> Trace:
     """What a step asks for.
 
     Args:
         looks_at_cells: whether it is one of those that update the occupancy grid.
+        replayed: whether a graph takes it.
     """
     first = OCCUPANCY_PERIOD * 2 + (0 if looks_at_cells else 1)
-    return _traces(optimiser, [first])[0]
+    return _traces(optimiser, [first], replayed=replayed)[0]
 
 
 def changing_lines(optimiser: JointOptimiser) -> set[str]:
     """Lines of code whose operations or numbers are others in later steps with as many rays.
 
-    Where there are any, a CUDA graph of the whole step would repeat what its first step did.
+    Where there are any, the CUDA graph of a whole step would repeat what the step did that was recorded.
     """
     first, *later = (trace.calls for trace in _traces(optimiser, [33, 34, 35, 36]))
     return {line for calls in later for line, _ in (first - calls) + (calls - first)}
 
 
-def _traces(optimiser: JointOptimiser, steps: list[int]) -> list[Trace]:
+def _traces(optimiser: JointOptimiser, steps: list[int], *, replayed: bool = False) -> list[Trace]:
     """Of these steps, all with the same number of rays, after the one before them, which puts constants there."""
-    made, recorder, found = _on_pretended_gpu(optimiser), Recorder(), []
+    recorder, found = Recorder(), []
+    made = _on_pretended_gpu(optimiser, recorder)
     rand, randint, rays = torch.rand, torch.randint, made.rays
 
     def launch(kernel: str, *arguments: object) -> None:
@@ -147,6 +183,8 @@ def _traces(optimiser: JointOptimiser, steps: list[int]) -> list[Trace]:
     ):
         made.step_index = steps[0] - 1
         made.step()
+        if made.graphs is not None:
+            made.graphs.replayed = replayed
         for step in steps:
             made.step_index, made.rays, recorder.trace = step, rays, Trace()
             with recorder:
@@ -155,7 +193,7 @@ def _traces(optimiser: JointOptimiser, steps: list[int]) -> list[Trace]:
     return found
 
 
-def _on_pretended_gpu(optimiser: JointOptimiser) -> JointOptimiser:
+def _on_pretended_gpu(optimiser: JointOptimiser, recorder: Recorder) -> JointOptimiser:
     """A copy of an optimiser with its tensors on the device, except counts of Adam's steps."""
 
     def moved(tensor: Tensor, memo: dict[int, Tensor]) -> Tensor:
@@ -173,6 +211,8 @@ def _on_pretended_gpu(optimiser: JointOptimiser) -> JointOptimiser:
         made = copy.deepcopy(optimiser, left)
     made.metrics, made.directions = PretendedMetrics(), pretended_directions
     made.occupancy = DeviceOccupancyGrid(optimiser.occupancy.side, GPU)
+    if not (optimiser.field.shape.broadcast or made.poses.double_step):
+        made.graphs = PretendedGraphs(made, recorder)
     return made
 
 
@@ -207,9 +247,11 @@ def main() -> None:
         optimiser = scene.untrained(images=100, threads=2, size=64, preset="paper")
         if stage == "fine":
             optimiser.start_reconstruction()
-        launches = traced_step(optimiser).launches
-        told = ", ".join(f"{n} {k}" for k, n in launches.most_common(12))
-        print(f"{stage}: {launches.total()} launches; {told}\nother numbers in later steps:")
+        for how, replayed in (("one by one", False), ("by a graph", True)):
+            launches = traced_step(optimiser, replayed=replayed).launches
+            told = ", ".join(f"{n} {k}" for k, n in launches.most_common(12))
+            print(f"{stage}, {how}: {launches.total()} launches; {told}")
+        print("other numbers in later steps:")
         print("", *sorted(changing_lines(optimiser)), sep="\n    ")
 
 

@@ -40,14 +40,16 @@ def photos(count: int, size: int) -> ImageSet:
     )
 
 
-def untrained(images: int, threads: int, size: int, preset: str) -> JointOptimiser:
+def untrained(
+    images: int, threads: int, size: int, preset: str, device: torch.device = CPU
+) -> JointOptimiser:
     """From true poses; as many steps of either stage as are trained here, and as many to come."""
-    options = RefineOptions(preset=preset, device="cpu", max_image_size=size, steps=4 * STEPS)
-    options = options.model_copy(update={"coarse_steps_max": 2 * STEPS}).resolved("cpu")
+    options = RefineOptions(preset=preset, device=device.type, max_image_size=size, steps=4 * STEPS)
+    options = options.model_copy(update={"coarse_steps_max": 2 * STEPS}).resolved(device.type)
     photo_set, poses = photos(images, size), synthetic_cameras(VIEWS, SEED)[np.arange(images) % VIEWS]
     frame = scene_frame(poses, photo_set)
     start = frame.unit_from_world.apply_to_poses(poses)
-    return JointOptimiser(photo_set, frame, start, options, [], CPU, threads)
+    return JointOptimiser(photo_set, frame, start, options, [], device, threads)
 
 
 @cache

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, cast
 
 import torch
 from torch import Tensor
@@ -49,6 +49,14 @@ class Graph(Protocol):
 
 # Work that only launches, and the generator that it draws from -> the graph, and what the work returned.
 Record = Callable[[Callable[[], StepOutcome], torch.Generator], tuple[Graph, StepOutcome]]
+Check = Callable[[], tuple[str, ...]]
+
+
+def graph_faults() -> tuple[str, ...]:
+    """What is wrong with recorded steps on this GPU, as its first use found out; see `graph_check`."""
+    from biresnerf.field.cuda.device_check import remembered_faults
+
+    return remembered_faults("biresnerf.refinement.optimise.graph_check")
 
 
 class CudaGraphs:
@@ -73,21 +81,27 @@ class StepGraphs:
 
     Args:
         record: how work is recorded.
+        check: what an earlier check found to be wrong with graphs here; asked before the first is made.
 
     Attributes:
         fault: why there are no graphs any more; None where there are.
         repeated: steps that graphs have taken.
     """
 
-    def __init__(self, optimiser: JointOptimiser, record: Record | None = None) -> None:
-        assert isinstance(optimiser.field, RecordableField)
-        self.optimiser, self.field = optimiser, optimiser.field
+    def __init__(
+        self, optimiser: JointOptimiser, record: Record | None = None, check: Check = graph_faults
+    ) -> None:
+        self.optimiser = optimiser
         self.fault: str | None = None
         self.repeated = 0
-        self._record = record or CudaGraphs()
+        self._record, self._check = record or CudaGraphs(), check
         self._controls = torch.zeros(len(CONTROLS), device=optimiser.device)
         self._places: Hashable = None
         self._graphs: dict[Hashable, tuple[Graph, StepOutcome] | None] = {}  # None: taken once
+
+    @property
+    def _field(self) -> RecordableField:
+        return cast(RecordableField, self.optimiser.field)
 
     @staticmethod
     def can_take(optimiser: JointOptimiser) -> bool:
@@ -106,14 +120,14 @@ class StepGraphs:
 
     def step(self, told: StepNumbers) -> StepOutcome:
         """`joint_step`."""
-        optimiser = self.optimiser
+        optimiser, field = self.optimiser, self._field
         trained = optimiser.sampler.trained(told.rays)
-        samples = self.field.prepare(told.rays, trained, told.marching, told.gradient, told.rates)
+        samples = field.prepare(told.rays, trained, told.marching, told.gradient, told.rates)
         if samples is None:
-            return joint_step(optimiser, told, self.field)
+            return joint_step(optimiser, told, field)
         written = self._written(told)
-        outcome = self._taken(told, lambda: joint_step(optimiser, written, _Prepared(self.field)))
-        self.field.finish()
+        outcome = self._taken(told, lambda: joint_step(optimiser, written, _Prepared(field)))
+        field.finish()
         if told.moves_lenses:
             optimiser.lenses.forget_present()
         return replace(outcome, samples=samples)
@@ -162,6 +176,17 @@ class StepGraphs:
 
     def _recorded(self, work: Callable[[], StepOutcome]) -> tuple[Graph, StepOutcome] | None:
         """A graph of the step, which remains to be taken; None where it could not be made or is wrong."""
+        found = next(iter(self._check()), None) or self._tried(work)
+        if not isinstance(found, str):
+            return found
+        self.fault = found
+        self._forget_gradients()
+        self.forget()
+        logger.warning("%s", slower_steps(self.optimiser)[0])
+        return None
+
+    def _tried(self, work: Callable[[], StepOutcome]) -> tuple[Graph, StepOutcome] | str:
+        """A graph of the step that repeats it; or why there is none."""
         tensors = self._moved()
         self._forget_gradients()
         try:
@@ -172,15 +197,10 @@ class StepGraphs:
             with self._undone(tensors):
                 once = work()
                 expected = _copies([*tensors, once.loss, once.error])
-            if _agree(before, repeated, expected):
-                return graph, outcome
-            self.fault = "a recorded step differs from the step itself"
         except RuntimeError as error:  # what CUDA does not allow here
-            self.fault = f"a step could not be recorded: {error}"
-        self._forget_gradients()
-        self.forget()
-        logger.warning("%s", slower_steps(self.optimiser)[0])
-        return None
+            return f"a step could not be recorded: {error}"
+        same = _agree(before, repeated, expected)
+        return (graph, outcome) if same else "a recorded step differs from the step itself"
 
     @contextmanager
     def _undone(self, tensors: Sequence[Tensor]) -> Iterator[list[Tensor]]:
@@ -210,7 +230,7 @@ class StepGraphs:
         if not told.moves_lenses:
             lenses = o.intrinsics
             read += [lenses.fx, lenses.fy, lenses.cx, lenses.cy, lenses.distortion]
-        return self.field.place, *(tensor.data_ptr() for tensor in read)
+        return self._field.place, *(tensor.data_ptr() for tensor in read)
 
     def _forget_gradients(self) -> None:
         """Memory of a graph must not remain as a gradient, nor a gradient as input of a graph."""

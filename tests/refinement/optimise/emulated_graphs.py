@@ -98,7 +98,7 @@ def as_on_a_gpu(optimiser: JointOptimiser, record: Record = emulated_graph) -> S
     )
     optimiser.directions = lens.directions_in_cam
     optimiser.camera_errors.add = optimiser.camera_errors.defined_add
-    optimiser.graphs = StepGraphs(optimiser, record)
+    optimiser.graphs = StepGraphs(optimiser, record, check=tuple)
     return optimiser.graphs
 
 

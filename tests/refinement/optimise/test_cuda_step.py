@@ -20,11 +20,19 @@ def test_a_step_waits_for_nothing_and_the_error_falls(tmp_path):
     options = tiny_options(device="cuda", steps=400, coarse_steps_max=200)
     optimiser = JointOptimiser(images, frame, start, options, [1], torch.device("cuda"), threads=1)
     first = [optimiser.step().mean_squared_error for _ in range(18)]
+    rays = optimiser.rays  # steps of other numbers of rays have graphs of their own, to be recorded first
+    for _ in range(4):
+        optimiser.rays = rays
+        optimiser.step()
+    assert optimiser.graphs.fault is None
+    repeated = optimiser.graphs.repeated
     torch.cuda.set_sync_debug_mode("error")
     try:
         for _ in range(20):  # one update of the occupancy grid among them
+            optimiser.rays = rays
             optimiser.step()
     finally:
         torch.cuda.set_sync_debug_mode("default")
+    assert optimiser.graphs.repeated == repeated + 20
     last = [optimiser.step().mean_squared_error for _ in range(60)]
     assert sum(last[-10:]) / 10 < sum(first[:5]) / 5

@@ -15,7 +15,7 @@ from biresnerf.field.cuda.field import CudaField
 from biresnerf.field.occupancy import DeviceOccupancyGrid
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.rigid_bodies import RigidBodies
-from biresnerf.refinement.optimise import joint_step
+from biresnerf.refinement.optimise import graph_check, joint_step
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.step_graphs import StepGraphs, slower_steps
 from biresnerf.refinement.parameters.intrinsics_parameters import lenses_of
@@ -114,7 +114,7 @@ def test_repeated_steps_are_exactly_those_taken_one_by_one(tiny, what):
 def test_the_kernels_steps_are_those_of_their_graphs_in_both_stages(tiny):
     plain, recorded = pair(tiny)
     for optimiser in (plain, recorded):
-        optimiser.field = optimiser.graphs.field = CudaField(OneColourField.SHAPE, 0, CPU, samples=2048)
+        optimiser.field = CudaField(OneColourField.SHAPE, 0, CPU, samples=2048)
     steps((plain, recorded), [16] * 6)
     in_stage_1 = recorded.graphs.repeated
     for optimiser in (plain, recorded):
@@ -237,3 +237,23 @@ def test_sizes_of_steps_are_few_and_near_any_number_of_rays():
     assert len(sizes) == 7 * 8 + 1
     assert all(StepGraphs.rays_of_size(size) == size for size in sizes)
     assert all(abs(StepGraphs.rays_of_size(rays) / rays - 1) < 0.05 for rays in range(256, 1 << 15))
+
+
+def test_the_check_of_a_gpu_names_what_is_wrong(tiny):
+    assert graph_check.faults(made(tiny), steps=6) == ()
+    assert "differs" in graph_check.faults(made(tiny, record=twice), steps=6)[0]
+    assert graph_check.faults(made(tiny), steps=2) == ("no step of stage 1 could be repeated",)
+
+
+def test_a_gpu_that_failed_its_check_records_nothing(tiny):
+    optimiser, recorded = made(tiny), []
+    optimiser.graphs = StepGraphs(optimiser, recorded.append, check=lambda: ("the check failed: signal 11",))
+    steps((optimiser,), [40] * 4)
+    assert recorded == []
+    assert "signal 11" in slower_steps(optimiser)[0]
+
+
+def test_the_scene_of_the_check_can_be_optimised():
+    optimiser = graph_check.small_optimiser(CPU)
+    optimiser.rays = 64
+    assert optimiser.step().samples > 64
