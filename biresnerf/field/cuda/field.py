@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -19,13 +18,12 @@ from biresnerf.field.cuda import plans
 from biresnerf.field.cuda.launches import refuse_the_wrong_mode
 from biresnerf.field.cuda.render_rays import RenderRays
 from biresnerf.field.cuda.sample_count import SampleCount
-from biresnerf.field.cuda.workspace import Capacity, Workspace
+from biresnerf.field.cuda.workspace import Capacity, Pass, Workspace
 from biresnerf.field.grid_field import BETA1, BETA2, GridField
 from biresnerf.field.radiance_field import (
     FieldRates,
     FieldShape,
     Marching,
-    Merging,
     PositionGradient,
     Rays,
     RecordableField,
@@ -88,7 +86,7 @@ class CudaField(GridField, RecordableField):
             of_tables: dict[str, float | Sequence[float]] = {}
             for name in self.modules:
                 of_tables |= self._rates(name, self._level_rates(name, rates), self.steps[name] + 1)
-            self._begin(_Pass(rays, trained, marching, gradient, samples), of_tables)
+            self._begin(Pass(rays, trained, marching, gradient, samples), of_tables)
         return samples
 
     def step_prepared(self, rates: FieldRates) -> None:
@@ -109,7 +107,7 @@ class CudaField(GridField, RecordableField):
         samples = self._foreseen(count, marching)
         if samples is None:
             samples = self._counted(rays, marching, gradient)
-        self._begin(_Pass(count, rays.trained, marching, gradient, samples))
+        self._begin(Pass(count, rays.trained, marching, gradient, samples))
         rendering = self.render_prepared(rays)
         self._note()
         return rendering
@@ -153,7 +151,7 @@ class CudaField(GridField, RecordableField):
                 rays.origin[taken], rays.direction[taken], rays.background[taken], rays.jitter[taken], trained=0
             )  # fmt: skip
             w = self._reserve(len(part.origin), 1, marching.most, side)
-            self._begin(_Pass(len(part.origin), 0, marching, gradient, 0))
+            self._begin(Pass(len(part.origin), 0, marching, gradient, 0))
             self._write_rays(w, part)
             w.plan(plans.viewing, marching.merging is not None).run()
             n = len(part.origin)
@@ -179,7 +177,7 @@ class CudaField(GridField, RecordableField):
         """Samples of rays, for which buffers grow. Only here a step of the optimisation waits for the device."""
         count, side = len(rays.origin), marching.occupied.shape[0]
         w = self._reserve(count, 1, marching.most, side)
-        self._begin(_Pass(count, rays.trained, marching, gradient, 0))
+        self._begin(Pass(count, rays.trained, marching, gradient, 0))
         self._write_rays(w, rays)
         w.plan(plans.marching).run()
         samples = int(w.buffers["marched"])
@@ -268,36 +266,16 @@ class CudaField(GridField, RecordableField):
         self._workspace = Workspace(self, Capacity(rays, self._samples, max(before.most, most), side))
         return self._workspace
 
-    def _begin(self, of: _Pass, others: Mapping[str, float | Sequence[float]] | None = None) -> None:
+    def _begin(self, of: Pass, others: Mapping[str, float | Sequence[float]] | None = None) -> None:
         """Write the numbers of a pass, and others, to the device."""
         w = self._workspace
         assert w is not None
         self._forward_number += 1
-        self._pass, marching, gradient = of, of.marching, of.gradient
-        w.buffers["occupied"].copy_(marching.occupied)
-        merging = marching.merging or Merging(0.0, 0)
-        values = {
-            "ray_count": of.rays, "trained_rays": of.trained,
-            "interval": marching.step, "near": marching.near, "far": marching.far,
-            "pose_smoothing": gradient.pose_smoothing, "pose_share": 1.0,
-            "reconstruction_smoothing": gradient.reconstruction_smoothing,
-            "reconstruction_share": gradient.reconstruction_share,
-            "merged_light": merging.light, "merged_most": merging.most,
-        }  # fmt: skip
-        w.write_controls({**values, **(others or {})})
+        self._pass = of
+        w.buffers["occupied"].copy_(of.marching.occupied)
+        w.write_controls({**of.controls(), **(others or {})})
         w.record()
 
     def _write_rays(self, w: Workspace, rays: Rays) -> None:
         for name in ("origin", "direction", "background", "jitter"):
             w.buffers[name][: len(rays.origin)].copy_(getattr(rays, name).detach())
-
-
-@dataclass(frozen=True)
-class _Pass:
-    """What is rendered at once: rays, those of them that teach the field, and the samples to expect."""
-
-    rays: int
-    trained: int
-    marching: Marching
-    gradient: PositionGradient
-    samples: int

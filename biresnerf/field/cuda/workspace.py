@@ -13,6 +13,7 @@ from torch import Tensor
 from biresnerf.field.cuda.launches import Plan
 from biresnerf.field.grid_field import OUTPUTS, GridField
 from biresnerf.field.grid_levels import GridLevels
+from biresnerf.field.radiance_field import Marching, Merging, PositionGradient
 from biresnerf.field.spherical_harmonics import VIEW_FEATURES
 
 CONTROLS = (
@@ -23,6 +24,29 @@ CONTROLS = (
 PROGRAMS_ELSEWHERE = 3
 
 Controls = Mapping[str, float | Sequence[float]]
+
+
+@dataclass(frozen=True)
+class Pass:
+    """What is rendered at once: rays, those of them that teach the field, and the samples to expect."""
+
+    rays: int
+    trained: int
+    marching: Marching
+    gradient: PositionGradient
+    samples: int
+
+    def controls(self) -> dict[str, float]:
+        """The values of `CONTROLS`."""
+        marching, gradient, merging = self.marching, self.gradient, self.marching.merging or Merging(0.0, 0)
+        return {
+            "ray_count": self.rays, "trained_rays": self.trained,
+            "interval": marching.step, "near": marching.near, "far": marching.far,
+            "pose_smoothing": gradient.pose_smoothing, "pose_share": 1.0,
+            "reconstruction_smoothing": gradient.reconstruction_smoothing,
+            "reconstruction_share": gradient.reconstruction_share,
+            "merged_light": merging.light, "merged_most": merging.most,
+        }  # fmt: skip
 
 
 @dataclass(frozen=True)
