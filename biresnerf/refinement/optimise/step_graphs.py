@@ -26,7 +26,7 @@ from biresnerf.field.radiance_field import (
     Rendering,
 )
 from biresnerf.refinement.optimise.joint_step import StepNumbers, StepOutcome, joint_step
-from biresnerf.refinement.optimise.optimiser_state import state_of
+from biresnerf.refinement.optimise.optimiser_state import Part, state_of
 
 if TYPE_CHECKING:
     from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
@@ -47,8 +47,10 @@ class Graph(Protocol):
     def replay(self) -> None: ...
 
 
-# Work that only launches, and the generator that it draws from -> the graph, and what the work returned.
-Record = Callable[[Callable[[], StepOutcome], torch.Generator], tuple[Graph, StepOutcome]]
+Work = Callable[[], StepOutcome]
+# Work that only launches, the generator that it draws from, and another graph, if there is one -> the graph of the
+# work, which no one runs while another runs, and what the work returned.
+Record = Callable[[Work, torch.Generator, Graph | None], tuple[Graph, StepOutcome]]
 Check = Callable[[], tuple[str, ...]]
 
 
@@ -59,18 +61,14 @@ def graph_faults() -> tuple[str, ...]:
     return remembered_faults("biresnerf.refinement.optimise.graph_check")
 
 
-class CudaGraphs:
-    """Records CUDA graphs that share their memory, as no two run at once."""
-
-    def __init__(self) -> None:
-        self._pool = torch.cuda.graph_pool_handle()
-
-    def __call__(self, work: Callable[[], StepOutcome], draws: torch.Generator) -> tuple[Graph, StepOutcome]:
-        graph = torch.cuda.CUDAGraph()
-        graph.register_generator_state(draws)
-        with torch.cuda.graph(graph, pool=self._pool, capture_error_mode="thread_local"):
-            outcome = work()
-        return graph, outcome
+def cuda_graph(work: Work, draws: torch.Generator, other: Graph | None) -> tuple[Graph, StepOutcome]:
+    """`Record` by CUDA. All graphs share their memory."""
+    graph = torch.cuda.CUDAGraph()
+    graph.register_generator_state(draws)
+    pool = other.pool() if isinstance(other, torch.cuda.CUDAGraph) else None
+    with torch.cuda.graph(graph, pool=pool, capture_error_mode="thread_local"):
+        outcome = work()
+    return graph, outcome
 
 
 class StepGraphs:
@@ -89,12 +87,12 @@ class StepGraphs:
     """
 
     def __init__(
-        self, optimiser: JointOptimiser, record: Record | None = None, check: Check = graph_faults
+        self, optimiser: JointOptimiser, record: Record = cuda_graph, check: Check = graph_faults
     ) -> None:
         self.optimiser = optimiser
         self.fault: str | None = None
         self.repeated = 0
-        self._record, self._check = record or CudaGraphs(), check
+        self._record, self._check = record, check
         self._controls = torch.zeros(len(CONTROLS), device=optimiser.device)
         self._places: Hashable = None
         self._graphs: dict[Hashable, tuple[Graph, StepOutcome] | None] = {}  # None: taken once
@@ -155,7 +153,7 @@ class StepGraphs:
         optimiser, moves = self.optimiser, (told.moves_poses, told.moves_lenses, told.moves_focal)
         return told.rays, moves, told.blur != 0, optimiser.switch is None, optimiser.lenses.given.terms
 
-    def _taken(self, told: StepNumbers, work: Callable[[], StepOutcome]) -> StepOutcome:
+    def _taken(self, told: StepNumbers, work: Work) -> StepOutcome:
         if self.fault is not None:
             return work()
         form, places = self._form(told), self._places_of(told)
@@ -165,7 +163,7 @@ class StepGraphs:
         if form not in self._graphs:
             self._graphs[form] = None
             return work()
-        found = self._graphs[form] or self._recorded(work)
+        found = self._graphs[form] or self._recorded(told, work)
         if found is None:
             return work()
         self._graphs[form] = found
@@ -174,9 +172,9 @@ class StepGraphs:
         self.repeated += 1
         return outcome
 
-    def _recorded(self, work: Callable[[], StepOutcome]) -> tuple[Graph, StepOutcome] | None:
+    def _recorded(self, told: StepNumbers, work: Work) -> tuple[Graph, StepOutcome] | None:
         """A graph of the step, which remains to be taken; None where it could not be made or is wrong."""
-        found = next(iter(self._check()), None) or self._tried(work)
+        found = next(iter(self._check()), None) or self._tried(told, work)
         if not isinstance(found, str):
             return found
         self.fault = found
@@ -185,13 +183,14 @@ class StepGraphs:
         logger.warning("%s", slower_steps(self.optimiser)[0])
         return None
 
-    def _tried(self, work: Callable[[], StepOutcome]) -> tuple[Graph, StepOutcome] | str:
+    def _tried(self, told: StepNumbers, work: Work) -> tuple[Graph, StepOutcome] | str:
         """A graph of the step that repeats it; or why there is none."""
-        tensors = self._moved()
+        tensors = self._moved(told)
+        other = next((made[0] for made in self._graphs.values() if made is not None), None)
         self._forget_gradients()
         try:
             with self._undone(tensors) as before:
-                graph, outcome = self._record(work, self.optimiser.draws)
+                graph, outcome = self._record(work, self.optimiser.draws, other)
                 graph.replay()
                 repeated = _copies([*tensors, outcome.loss, outcome.error])
             with self._undone(tensors):
@@ -214,17 +213,20 @@ class StepGraphs:
                 tensor.copy_(value)
             draws.set_state(chance)
 
-    def _moved(self) -> list[Tensor]:
+    def _moved(self, told: StepNumbers) -> list[Tensor]:
         """The tensors that a step changes."""
         o = self.optimiser
-        state = state_of({"field": o.field, "poses": o.poses, "lenses": o.lenses, "exposure": o.exposure})
+        parts: dict[str, Part] = {"field": o.field, "poses": o.poses, "exposure": o.exposure}
+        if told.moves_lenses:
+            parts["lenses"] = o.lenses
+        state = state_of(parts)
         del state["field.counters"]  # a copy of the host's
         return [*state.values(), o.camera_errors.sums]
 
     def _places_of(self, told: StepNumbers) -> Hashable:
         """Where the tensors lie that a step reads or changes."""
         o = self.optimiser
-        read = [*self._moved(), o.mobility]
+        read = [*self._moved(told), o.mobility]
         if o.camera_errors.weights is not None:
             read.append(o.camera_errors.weights)
         if not told.moves_lenses:

@@ -1,7 +1,7 @@
 """CUDA graphs without a GPU: what a step launches is recorded, and repeated on the same memory.
 
-As on a GPU, recording leaves everything as it was, memory made meanwhile holds nothing of use until the first
-repetition, and random numbers come from the generator anew each time. Triton's interpreter runs the kernels.
+As on a GPU, recording leaves everything as it was, memory made meanwhile holds nothing of use before a repetition, and
+random numbers come from the generator anew each time. Triton's interpreter runs the kernels.
 """
 
 from __future__ import annotations
@@ -25,12 +25,14 @@ Call = tuple[Callable[..., object], tuple, dict, object]  # what is called, with
 
 
 class EmulatedGraph:
-    """Calls with the very tensors that they had."""
+    """Calls with the very tensors that they had; `made` are those that were made meanwhile."""
 
-    def __init__(self, calls: list[Call]) -> None:
-        self._calls = calls
+    def __init__(self, calls: list[Call], made: list[Tensor]) -> None:
+        self._calls, self._made = calls, made
 
     def replay(self) -> None:
+        for tensor in self._made:
+            tensor.untyped_storage().fill_(0x7F)  # huge numbers, as another graph may have used the memory
         with torch._C._AutoDispatchBelowAutograd():
             for function, args, kwargs, recorded in self._calls:
                 given = {_memory(tensor) for tensor in _tensors((args, kwargs))}
@@ -75,19 +77,17 @@ class _Recording(TorchDispatchMode):
     def undo(self) -> None:
         for storage, held in self._before.values():
             storage.copy_(held)
-        for tensor in self.made.values():
-            tensor.untyped_storage().fill_(0x7F)  # huge numbers
 
 
-def emulated_graph(work: Callable, draws: torch.Generator):
-    """In place of `CudaGraphs`."""
+def emulated_graph(work: Callable, draws: torch.Generator, _other: object = None):
+    """In place of `cuda_graph`."""
     recording, chance, run = _Recording(), draws.get_state(), GridExecutor.__call__
     launch = lambda executor, *args, **kwargs: recording.launch(executor, run, args, kwargs)  # noqa: E731
     with recording, patch.object(GridExecutor, "__call__", launch):
         outcome = work()
     recording.undo()
     draws.set_state(chance)
-    return EmulatedGraph(recording.calls), outcome
+    return EmulatedGraph(recording.calls, list(recording.made.values())), outcome
 
 
 def as_on_a_gpu(optimiser: JointOptimiser, record: Record = emulated_graph) -> StepGraphs:

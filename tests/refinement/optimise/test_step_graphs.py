@@ -200,11 +200,11 @@ def test_random_numbers_that_are_drawn_while_recording_only_are_found(tiny, monk
     assert "field.weights" in differing(plain, recorded)
 
 
-def broken(work, draws):
+def broken(work, draws, other):
     raise RuntimeError("CUDA error: operation not permitted when stream is capturing")
 
 
-def twice(work, draws):
+def twice(work, draws, other):
     graph, outcome = emulated_graph(work, draws)
     replay = graph.replay
     graph.replay = lambda: (replay(), replay())
