@@ -106,7 +106,7 @@ GUESSED = np.arange(7) == 2
 )
 def test_repeated_steps_are_exactly_those_taken_one_by_one(tiny, what):
     plain, recorded = pair(tiny, **what)
-    for rays in ([40] * 9 + [50] * 3, [40] * 2):
+    for rays in ([40] * 9, [40] * 2, [50] * 4, [40] * 2):
         expected, told = steps((plain, recorded), rays)
         assert told == expected
         assert torch.equal(recorded.intrinsics.fx, plain.intrinsics.fx)
