@@ -38,6 +38,7 @@ from biresnerf.refinement.verdict.evaluate import Evaluation, evaluate
 from biresnerf.refinement.verdict.judgement import judge
 from biresnerf.refinement.verdict.pose_uncertainty import pose_uncertainty
 from biresnerf.refinement.verdict.run_report import run_report
+from biresnerf.refinement.verdict.so_far import poses_so_far
 from biresnerf.refinement.views.held_out_views import held_out_views
 from biresnerf.report import Report
 from biresnerf.resume import earlier_work, refuse_other_run, reusable_seeding, run_origin
@@ -105,8 +106,9 @@ def refine_poses(
         report = run_report(stages, evaluation.scores, judgement, "complete", finish, known)
         report = write_result(setup.folder, stages, evaluation, report)
     except Interrupted:
-        report = run_report(stages, evaluation.scores, judgement, "partial")
-        write_result(setup.folder, stages, evaluation, report)
+        so_far = poses_so_far(stages) if judgement is None else None
+        report = run_report(stages, evaluation.scores, judgement, "partial", so_far=so_far)
+        write_result(setup.folder, stages, evaluation, report, so_far)
         raise
     remember_rates(setup.device.type, setup.threads, setup.monitor.forecast.measured(TELLING_S))
     return report
@@ -218,6 +220,9 @@ def _first_step(scene: Scene, origin: RunOrigin, setup: _Setup, observer: Observ
     stages = TwoStages(optimiser, scene, setup.folder.path, origin, setup.monitor, observer)
     if setup.earlier is not None:
         stages.restore(setup.earlier)
+        poses_so_far(
+            stages
+        )  # a partial result may hold these poses, which were measured after the checkpoint
         setup.monitor.report(Progress(stage="preparing", message=f"resuming at step {optimiser.step_index}"))
     expect_rest(stages)
     return stages

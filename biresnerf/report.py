@@ -260,8 +260,7 @@ class Report(FrozenModel):
     state: Literal["complete", "partial"] = Field(description="partial: stopped before the end, on request.")
     options: ResolvedOptions
     verdict: Verdict | None = Field(
-        None,
-        description="None of a partial result, and where none was asked for; the poses are the refined ones then.",
+        None, description="None of a partial result, and where none was asked for."
     )
     verdict_so_far: Verdict | None = Field(
         None, examples=[None], description="Of a preview or a partial result: by feature matches alone."

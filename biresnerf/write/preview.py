@@ -20,8 +20,8 @@ from biresnerf.forecast import Phase
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.progress import Monitor, Progress
 from biresnerf.refinement.stages.two_stages import TwoStages
-from biresnerf.refinement.start.first_step import poses_in_input_frame
 from biresnerf.refinement.verdict.run_report import run_report
+from biresnerf.refinement.verdict.so_far import poses_so_far
 from biresnerf.refinement.views.evaluation import render_view
 from biresnerf.write.output_folder import REPORT, OutputFolder
 from biresnerf.write.result import described, write_rendered
@@ -31,16 +31,15 @@ PHASES: tuple[Phase, ...] = ("features", "matching", "mapping")  # of seeding
 
 
 def write_preview(folder: OutputFolder, stages: TwoStages) -> tuple[str, ...]:
-    """Write the poses so far, the report on them, and one view at half the working size.
+    """Write the best poses so far, the report on them, and one view as the field is now, at half the working size.
 
     Returns the files, relative to the output folder.
     """
-    dataset, optimiser, path = stages.scene.dataset, stages.optimiser, folder.preview
-    world_from_cam, _ = poses_in_input_frame(dataset, optimiser)
-    report = run_report(stages, [], None, "partial")
-    refined = optimiser.lenses.refined(dataset)
-    write_transforms(refined, world_from_cam, path / TRANSFORMS)
-    write_poses_json(described(refined, world_from_cam, report), path / POSES)
+    path, so_far = folder.preview, poses_so_far(stages)
+    report = run_report(stages, [], None, "partial", so_far=so_far)
+    world_from_cam, dataset = so_far.offered(stages.scene)
+    write_transforms(dataset, world_from_cam, path / TRANSFORMS)
+    write_poses_json(described(dataset, world_from_cam, report), path / POSES)
     write_text(path / REPORT, report.model_dump_json(indent=2))
     names = [POSES, REPORT, TRANSFORMS]
     if stages.history.path.is_file():

@@ -25,8 +25,9 @@ from biresnerf.geometry.similarity import Similarity
 from biresnerf.progress import Monitor, Progress
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.two_stages import TwoStages
-from biresnerf.refinement.start.first_step import poses_in_input_frame
+from biresnerf.refinement.start.refined_poses import RefinedPoses
 from biresnerf.refinement.verdict.evaluate import Evaluation
+from biresnerf.refinement.verdict.so_far import SoFar
 from biresnerf.refinement.views.compare_rigs import BeforeAfter
 from biresnerf.refinement.views.evaluation import RenderedView, ViewScore
 from biresnerf.refinement.views.shown_views import Points
@@ -40,11 +41,20 @@ logger = logging.getLogger(__name__)
 SOLID = 0.5  # opacity from which a depth means something
 
 
-def write_result(folder: OutputFolder, stages: TwoStages, evaluation: Evaluation, report: Report) -> Report:
+def write_result(
+    folder: OutputFolder,
+    stages: TwoStages,
+    evaluation: Evaluation,
+    report: Report,
+    so_far: SoFar | None = None,
+) -> Report:
     """Write poses in the input's frame, in the input's form and in others, the options, and last the report.
 
     Where the verdict keeps the input's poses, those are written, and the refined ones beside them in refined/. Once the
     result is complete, what only an unfinished run needs is removed.
+
+    Args:
+        so_far: what a run offers that has no verdict yet; the present poses if not given.
 
     Returns the report with notes on what was written.
 
@@ -56,12 +66,13 @@ def write_result(folder: OutputFolder, stages: TwoStages, evaluation: Evaluation
         stages.monitor.report(Progress(stage="exporting"))
     scene, optimiser, path = stages.scene, stages.optimiser, folder.path
     write_text(path / CONFIG, optimiser.options.model_dump_json(indent=2))
-    refined, input_from_optimised = poses_in_input_frame(scene.dataset, optimiser)
-    refined_dataset = optimiser.lenses.refined(scene.dataset)
-    surface = evaluation.surface(optimiser.frame.unit_from_world, input_from_optimised)
+    found = so_far.refined if so_far is not None else RefinedPoses.now(scene.dataset, optimiser)
+    refined, refined_dataset = found.world_from_cam, found.dataset
+    surface = evaluation.surface(optimiser.frame.unit_from_world, found.input_from_optimised)
     field = FieldPoints(*surface, refined) if np.isfinite(refined).all() else None
     returned, returned_dataset, poses, moved = refined, refined_dataset, POSES, None
-    if report.verdict is not None and report.verdict.returned == "input":
+    verdict = report.verdict or report.verdict_so_far
+    if verdict is not None and verdict.returned == "input":
         returned, returned_dataset = scene.dataset.world_from_cam, scene.dataset
         if np.isfinite(refined).all():
             # What is said of the returned poses is not said of these.

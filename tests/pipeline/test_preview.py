@@ -3,18 +3,29 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
-from biresnerf.data.formats.read_dataset import read_dataset
+from biresnerf.data.formats.read_dataset import read_dataset, read_poses
+from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.synthetic.scene import write_synthetic_scene
 from biresnerf.errors import Interrupted
+from biresnerf.geometry.perturb import perturb_poses
+from biresnerf.geometry.pose_error import pose_error
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.pipeline import refine_poses
 from biresnerf.progress import Progress
+from biresnerf.refinement.optimise.async_metrics import StepResult
+from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.stages import two_stages
+from biresnerf.refinement.stages.checkpoint import TRACKS
 from biresnerf.report import Report
+from biresnerf.studies.scenes import with_poses
+from tests.refinement.verdict.test_judgement import VIEWS, true_matches
 
 pytestmark = pytest.mark.slow
 
@@ -68,3 +79,47 @@ def test_a_run_stopped_after_its_last_step_leaves_a_partial_result_and_goes_on(t
     assert not (output / "pinhole").exists(), "no half of a pack"
     assert refine_poses(scene, output, options).state == "complete"
     assert (output / "pinhole" / "sparse" / "0" / "images.bin").is_file()
+
+
+def test_a_preview_and_what_a_stopped_run_leaves_hold_the_best_poses_and_not_the_last(tmp_path, monkeypatch):
+    truth = read_dataset(write_synthetic_scene(tmp_path / "scene", VIEWS, 32, seed=3))
+    given = with_poses(truth, perturb_poses(truth.world_from_cam, 0.1, seed=1))
+    output = tmp_path / "out"
+    (output / TRACKS).parent.mkdir(parents=True)
+    with (output / TRACKS).open("wb") as file:
+        np.savez(file, names=np.array(truth.names), **true_matches(truth).kept())
+    told: list[Progress] = []
+    seen: list[float] = []
+    real_step = two_stages.step_that_fits
+
+    def wandering_step(optimiser: JointOptimiser) -> StepResult:
+        result = real_step(optimiser)
+        poses = perturb_poses(truth.world_from_cam, (0.01, 0.05)[bool(seen)], seed=1)
+        unit = optimiser.frame.unit_from_world.apply_to_poses(poses)
+        optimiser.poses.place(torch.from_numpy(unit))
+        return result
+
+    def error_deg(folder: Path) -> float:
+        poses = np.stack(list(read_poses(folder / "transforms.json").values()))
+        return pose_error(poses, truth.world_from_cam).aligned_robust.rotation_deg.mean
+
+    def listen(progress: Progress) -> None:
+        told.append(progress)
+        if progress.preview:
+            seen.append(error_deg(output / "preview"))
+
+    monkeypatch.setattr(two_stages, "step_that_fits", wandering_step)
+    for so_many in (2, 3):  # in the run, and in the one that goes on from it
+        with pytest.raises(Interrupted):
+            refine_poses(given, output, OPTIONS, listen, lambda: len(seen) >= so_many)  # noqa: B023
+        report = Report.model_validate_json((output / "report.json").read_text())
+        assert (report.state, report.verdict) == ("partial", None)
+        assert (report.verdict_so_far.verdict, report.verdict_so_far.returned) == ("improved", "refined")
+        assert error_deg(output) == pytest.approx(seen[0], abs=1e-4)
+    assert report.resumed == 1
+    assert seen == pytest.approx([seen[0]] * 3, abs=1e-4)
+    assert seen[0] < error_deg_of(given, truth) / 5
+
+
+def error_deg_of(given: Dataset, truth: Dataset) -> float:
+    return pose_error(given.world_from_cam, truth.world_from_cam).aligned_robust.rotation_deg.mean

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 
 import torch
@@ -213,6 +214,12 @@ class IntrinsicsParameters:
         above, below, tangential = (max(t, int(g.nonzero().max()) + 1 if g.any() else 0) for t, g in groups)
         self.given = replace(self.given, terms=(above, below, tangential))
         self.forget_present()
+
+    def at(self, increments: Tensor) -> IntrinsicsParameters:
+        """These lenses at another moment's increments [cameras, columns]: to be looked at, not to be stepped."""
+        other = copy(self)
+        other.increments = increments.to(self.increments)
+        return other
 
     def forget_gradients(self) -> None:
         self._adam.zero_grad()

@@ -21,6 +21,7 @@ from biresnerf.errors import InputError
 from biresnerf.frozen_model import FrozenModel
 from biresnerf.refinement.lost.lost_cameras import RepairState
 from biresnerf.refinement.optimise.optimiser_state import StepState
+from biresnerf.refinement.stages.best_so_far import BestSoFar
 from biresnerf.refinement.stages.stability import DetectorState
 from biresnerf.report import SwitchReason
 
@@ -54,12 +55,14 @@ class RunRecord(FrozenModel, arbitrary_types_allowed=True):
         resumed: how often.
         switch_reason: why stage 2 began.
         adjusted: whether all cameras were adjusted on the way through stage 2.
+        best: the poses to offer before the end; None while none were better than the input's.
         seconds: spent in each part of the run.
     """
 
     resumed: int = 0
     switch_reason: SwitchReason | None = None
     adjusted: bool = False
+    best: BestSoFar | None = None
     seconds: dict[str, float] = Field(default_factory=lambda: {"coarse": 0.0, "fine": 0.0})
 
 

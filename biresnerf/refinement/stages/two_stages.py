@@ -106,9 +106,10 @@ class TwoStages:
         """Step until this share of all steps is taken, and write a checkpoint. Raises as `run_stage_1`."""
         while self.optimiser.step_index < round(share * self.optimiser.schedule.steps):
             self._step()
-        self._save()
         # What follows may take long: meanwhile a preview shows the poses, and a stop loses nothing.
-        self.monitor.report(self._progress(CHECKPOINT.as_posix(), self._preview()))
+        preview = self._preview()
+        self._save()
+        self.monitor.report(self._progress(CHECKPOINT.as_posix(), preview))
 
     def replan(self) -> None:
         """The rest of the run may become shorter or longer: how long it takes has been measured."""
@@ -174,11 +175,11 @@ class TwoStages:
             self._check(result)
         now = time.monotonic()
         self.record.seconds[stage] += now - started
+        preview = self._preview() if self._previews.due else ()  # first: the checkpoint holds what it found
         checkpoint = None
         if now - self._saved >= options.checkpoint_every_s:
             self._save()
             self._saved, checkpoint = time.monotonic(), CHECKPOINT.as_posix()
-        preview = self._preview() if self._previews.due else ()
         if checkpoint or preview or now - self._reported >= REPORT_PERIOD_S:
             self._reported = now
             self.monitor.report(self._progress(checkpoint, preview))

@@ -1,4 +1,4 @@
-"""From initial poses to the optimisation at its first step, and from optimised poses back to the input's frame."""
+"""From initial poses to the optimisation at its first step."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.data.workload import can_be_adjusted
-from biresnerf.geometry.similarity import Similarity, align_by_spread, align_robust
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.methods import Method, find_method
@@ -65,23 +64,3 @@ def stage_lengths(start: InitialPoses, asked: RefineOptions, resolved: ResolvedO
     names = [n for n in ("coarse_steps_min", "coarse_steps_max") if getattr(asked, n) is None]
     shorter = {name: round(MATCHED_COARSE_SHARE * getattr(resolved, name)) for name in names}
     return resolved.model_copy(update=shorter)
-
-
-def poses_in_input_frame(
-    dataset: Dataset, optimiser: JointOptimiser
-) -> tuple[NDArray[np.float64], Similarity]:
-    """Refined world_from_cam [n, 4, 4] in the input's frame, and the similarity `input_from_optimised`.
-
-    The optimisation leaves frame and scale free. The similarity that fits the optimised poses to the given ones best
-    fixes them; it is robust to lost cameras unless the method says otherwise. Fixed cameras and rigs leave less free.
-    """
-    world_from_unit = optimiser.frame.unit_from_world.inverse()
-    optimised = world_from_unit.apply_to_poses(optimiser.poses.poses().numpy())
-    given, tied = dataset.world_from_cam, dataset.anchors
-    input_from_optimised = optimiser.bodies.input_from_optimised(optimised, given)
-    if input_from_optimised is None and optimiser.method.robust_frame:
-        input_from_optimised = align_robust(optimised[tied], given[tied], with_rotations=True)
-    elif input_from_optimised is None:
-        input_from_optimised = align_by_spread(optimised[tied], given[tied])
-    carried = input_from_optimised.apply_to_poses(optimised)
-    return optimiser.bodies.restored(carried, given), input_from_optimised

@@ -20,7 +20,7 @@ from biresnerf.refinement.lost.own_matches import contradicted
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.two_stages import TwoStages
-from biresnerf.refinement.start.first_step import poses_in_input_frame
+from biresnerf.refinement.start.refined_poses import RefinedPoses
 from biresnerf.refinement.verdict import image_flags
 from biresnerf.refinement.verdict.pose_evidence import (
     EpipolarComparison,
@@ -96,16 +96,6 @@ def _rounds(stages: TwoStages) -> int:
     return int(min(max(in_time, 1), ROUNDS_MOST))
 
 
-def verdict_so_far(stages: TwoStages) -> Verdict | None:
-    """What feature matches and motion say of the poses as they are now; None where the options ask for no verdict.
-
-    No field is trained for it: it takes as long as a few steps.
-    """
-    if not stages.optimiser.options.verdict:
-        return None
-    return decide(_compare(stages.scene, stages.optimiser).findings)
-
-
 def judge_poses(
     scene: Scene,
     optimiser: JointOptimiser,
@@ -122,7 +112,9 @@ def judge_poses(
         Interrupted: ``should_stop`` returned true.
     """
     report(0.0)
-    found = _compare(scene, optimiser)
+    refined = RefinedPoses.now(scene.dataset, optimiser)
+    lost = int(optimiser.camera_errors.lost.sum())
+    found = compare_without_training(scene, refined, lost)
     heldout: HeldOutComparison | None = None
     if found.findings.moved_px >= MEASURABLE_PX:
         heldout = compare_placed(
@@ -135,8 +127,8 @@ def judge_poses(
 
 
 @dataclass(frozen=True, eq=False)
-class _Compared:
-    """The input's poses and the optimised ones, compared by all but unseen views.
+class Compared:
+    """The input's poses and refined ones, compared by all but unseen views.
 
     Attributes:
         before, after: in the input's frame.
@@ -153,16 +145,15 @@ class _Compared:
     findings: Findings
 
 
-def _compare(scene: Scene, optimiser: JointOptimiser) -> _Compared:
+def compare_without_training(scene: Scene, refined: RefinedPoses, lost: int) -> Compared:
+    """The input's poses and refined ones by motion and feature matches; `lost` cameras agree with no pose found."""
     dataset, images = scene.dataset, scene.images
-    refined = optimiser.lenses.refined(dataset)
     rows = range(len(dataset))
     before = Rig(dataset.world_from_cam, tuple(dataset.camera_of(i) for i in rows))
-    after = Rig(poses_in_input_frame(dataset, optimiser)[0], tuple(refined.camera_of(i) for i in rows))
+    after = Rig(refined.world_from_cam, tuple(refined.dataset.camera_of(i) for i in rows))
     turned, shifted = motion(before.world_from_cam, after.world_from_cam)
     spread = rms_spread(before.world_from_cam[:, :3, 3])
     grounded = sum(frame.pose_source not in GUESSED for frame in dataset.frames) > len(dataset) / 2
-    lost = int(optimiser.camera_errors.lost.sum())
     failed = failed_checks(after.world_from_cam, lost)
     epipolar: EpipolarComparison | None = None
     moved = 0.0
@@ -183,7 +174,7 @@ def _compare(scene: Scene, optimiser: JointOptimiser) -> _Compared:
         working_share=working_share(before, images),
         out_of_frame=frame_doubt(turned, shifted, spread) if grounded and not failed else "",
     )
-    return _Compared(before, after, placed, turned, shifted, epipolar, findings)
+    return Compared(before, after, placed, turned, shifted, epipolar, findings)
 
 
 def motion(before: Array, after: Array) -> tuple[Array, Array]:
@@ -203,7 +194,7 @@ def _with_images(
     verdict: Verdict,
     images: ImageSet,
     optimiser: JointOptimiser,
-    found: _Compared,
+    found: Compared,
     heldout: HeldOutComparison | None,
 ) -> Judgement:
     trial_psnr, epipolar_px = np.full((2, len(images)), np.nan), np.full((2, len(images)), np.nan)

@@ -9,7 +9,7 @@ from biresnerf.refinement.finish.expected_errors import ExpectedErrors, expected
 from biresnerf.refinement.finish.outcome import Finish
 from biresnerf.refinement.lost.own_matches import contradicted
 from biresnerf.refinement.stages.two_stages import TwoStages
-from biresnerf.refinement.start.first_step import poses_in_input_frame
+from biresnerf.refinement.start.refined_poses import RefinedPoses
 from biresnerf.refinement.verdict.judgement import Judgement
 from biresnerf.uncertainty import KnownFrom, PoseUncertainty
 
@@ -32,7 +32,8 @@ def pose_uncertainty(
     optimiser, dataset = stages.optimiser, stages.scene.dataset
     if not optimiser.method.robust_extensions:
         return ()
-    poses, input_from_optimised = poses_in_input_frame(dataset, optimiser)
+    refined = RefinedPoses.now(dataset, optimiser)
+    poses, input_from_optimised = refined.world_from_cam, refined.input_from_optimised
     errors_px = np.full((2, len(dataset)), np.nan) if judgement is None else judgement.epipolar_px
     wrong = contradicted(errors_px[1])
     if judgement is not None and judgement.verdict.returned == "input":

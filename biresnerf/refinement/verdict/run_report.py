@@ -21,10 +21,11 @@ from biresnerf.refinement.optimise.step_graphs import slower_steps
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.two_stages import TwoStages
 from biresnerf.refinement.start.choose_start import MARGIN_DB
-from biresnerf.refinement.start.first_step import poses_in_input_frame
+from biresnerf.refinement.start.refined_poses import RefinedPoses
 from biresnerf.refinement.verdict.camera_reports import camera_reports, focal_warnings
-from biresnerf.refinement.verdict.judgement import Judgement, motion, verdict_so_far
+from biresnerf.refinement.verdict.judgement import Judgement, motion
 from biresnerf.refinement.verdict.pose_uncertainty import FIXED
+from biresnerf.refinement.verdict.so_far import SoFar
 from biresnerf.refinement.views.evaluation import ViewScore
 from biresnerf.refinement.views.floaters import unshared_opacity
 from biresnerf.report import HeldOut, ImageReport, Report
@@ -38,6 +39,7 @@ def run_report(
     state: Literal["complete", "partial"],
     finish: Finish = Finish(),
     uncertainty: tuple[PoseUncertainty, ...] = (),
+    so_far: SoFar | None = None,
 ) -> Report:
     """The report of a run as it is now.
 
@@ -46,20 +48,21 @@ def run_report(
         judgement: None where there is no verdict.
         finish: what came of the adjustment of all cameras.
         uncertainty: of each image's returned pose, or nothing.
+        so_far: what a run offers that has no verdict yet; the present poses if not given.
     """
     from biresnerf import __version__
 
     scene, optimiser, record = stages.scene, stages.optimiser, stages.record
     dataset = scene.dataset
-    refined, similarity = poses_in_input_frame(dataset, optimiser)
+    refined = so_far.refined if so_far is not None else RefinedPoses.now(dataset, optimiser)
     return Report(
         version=__version__,
         state=state,
         options=optimiser.options,
         verdict=judgement.verdict if judgement is not None else None,
-        verdict_so_far=verdict_so_far(stages) if state == "partial" and judgement is None else None,
-        images=_image_reports(stages, scores, judgement, refined, uncertainty),
-        cameras=camera_reports(dataset, optimiser.lenses),
+        verdict_so_far=so_far.verdict if so_far is not None else None,
+        images=_image_reports(stages, scores, judgement, refined.world_from_cam, uncertainty),
+        cameras=camera_reports(dataset, refined.lenses),
         heldout=held_out_report(optimiser, scores) if scores else None,
         start_trials=scene.start.trials,
         candidates=finish.candidates,
@@ -73,9 +76,9 @@ def run_report(
         device=str(optimiser.device),
         threads=optimiser.threads,
         working_size=(int(scene.images.widths.max()), int(scene.images.heights.max())),
-        input_from_optimised=similarity.report(),
+        input_from_optimised=refined.input_from_optimised.report(),
         warnings=dataset.warnings
-        + focal_warnings(dataset, optimiser.lenses)
+        + focal_warnings(dataset, refined.lenses)
         + turntable_warnings(scene.start)
         + accuracy_warnings(finish.given, optimiser.options)
         + unmatched_warnings(scene)

@@ -94,7 +94,7 @@ function camerasOf(poses: PosesDocument, report: Report | null): SceneCamera[] {
       delta_psnr: measured ? (measures.trial_psnr_after ?? 0) - (measures.trial_psnr_before ?? 0) : null,
       flags: image.flags,
       uncertainty: measures?.uncertainty ?? null,
-      returned: report?.verdict?.returned === "input" && before ? before : after,
+      returned: (report?.verdict ?? report?.verdict_so_far)?.returned === "input" && before ? before : after,
     };
   });
 }

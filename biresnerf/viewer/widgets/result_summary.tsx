@@ -101,7 +101,7 @@ function figuresOf(report: Report, rows: readonly ImageRow[]): Figure[] {
   const positions = rows.flatMap(({ position_90 }) => (position_90 === null ? [] : [position_90]));
   const error = report.verdict?.epipolar?.error_px;
   const gain = report.verdict?.heldout?.psnr;
-  const kept = report.verdict?.returned === "input";
+  const kept = (report.verdict ?? report.verdict_so_far)?.returned === "input";
   return [
     ...(gain ? [{ name: "Unseen views gain", value: `${signed(gain.difference, 1)} dB`, note: sureWords(gain) }] : []),
     {

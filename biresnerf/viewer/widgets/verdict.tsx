@@ -14,7 +14,7 @@ export function VerdictSentence({ report: { verdict, verdict_so_far, state, opti
         <>
           <span class="chip chip-plain">{state === "partial" ? "partial" : "no verdict"}</span>
           {state === "partial"
-            ? `The run was stopped early: these are the best poses so far. ${verdict_so_far?.why[0] ?? "They were not compared with the input's."}`
+            ? `The run was stopped early. ${soFarWords(verdict_so_far)}`
             : options.verdict === false
               ? "No verdict was requested: the result holds the refined poses."
               : "No verdict was reached."}
@@ -24,11 +24,19 @@ export function VerdictSentence({ report: { verdict, verdict_so_far, state, opti
   );
 }
 
+const WHOSE = { given: "your own poses", seeded: "the poses from feature matches", mixed: "the poses it started from" };
+
 /** Which poses are in the downloads. */
 function returnedWords({ returned, compared_with }: Verdict): string {
   if (returned === "refined") return "The downloads contain the refined poses.";
-  const whose = { given: "your own poses", seeded: "the poses from feature matches", mixed: "the poses it started from" };
-  return `The downloads contain ${whose[compared_with]}; the refined ones are in refined/.`;
+  return `The downloads contain ${WHOSE[compared_with]}; the refined ones are in refined/.`;
+}
+
+/** The same of a run that has no verdict yet. */
+function soFarWords(verdict: Verdict | null): string {
+  if (!verdict) return "The downloads contain its latest poses, which were not compared with the input's.";
+  const whose = verdict.returned === "input" ? `${WHOSE[verdict.compared_with]}: no better ones were found until then` : "the best poses so far";
+  return `The downloads contain ${whose}. ${verdict.why[0]}`;
 }
 
 /** The two measurements behind a verdict, folded away. */

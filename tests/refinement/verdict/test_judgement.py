@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from biresnerf.data.photos.images import ImageSet, load_images
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.refinement.verdict.image_flags import blurred, exposure_off, moved_far, sharpness
-from biresnerf.refinement.verdict.judgement import Judgement, judge_poses, verdict_so_far
+from biresnerf.refinement.verdict.judgement import Judgement, judge_poses
 from biresnerf.refinement.verdict.pose_evidence import compare_on_matches, working_share
 from biresnerf.refinement.views import pose_trials
 from biresnerf.refinement.views.compare_rigs import Rig
@@ -130,31 +129,6 @@ def test_matches_alone_tell_good_poses_from_bad_ones(scene, noisy, monkeypatch):
     assert (better.verdict.verdict, worse.verdict.verdict) == ("improved", "kept_input")
     assert better.verdict.epipolar.error_px.after < 0.3 < better.verdict.epipolar.error_px.before
     assert np.nanmax(better.epipolar_px[1]) < np.nanmin(better.epipolar_px[0])
-
-
-def test_before_its_end_a_run_says_what_matches_tell_of_its_poses_and_trains_nothing(
-    scene, noisy, monkeypatch
-):
-    def refuse(*_, **__):
-        raise AssertionError("a field is trained")
-
-    monkeypatch.setattr(f"{judge_poses.__module__}.compare_placed", refuse)
-    true = scene[0].world_from_cam
-
-    def so_far(given: np.ndarray, now: np.ndarray, tracks: Tracks | None, *, asked: bool = True):
-        dataset, images = scene
-        optimiser = tiny_optimiser(
-            with_poses(dataset, now), images, OPTIONS.model_copy(update={"verdict": asked}), held_out=[3]
-        )
-        run = replace(given_scene(with_poses(dataset, given), images, [3]), tracks=tracks)
-        return verdict_so_far(SimpleNamespace(scene=run, optimiser=optimiser))
-
-    matches = true_matches(scene[0])
-    assert so_far(noisy, true, matches).verdict == "improved"
-    assert so_far(true, noisy, matches).verdict == "kept_input"
-    assert so_far(noisy, true, None).verdict == "inconclusive"
-    assert so_far(noisy, noisy, matches).verdict == "unchanged"
-    assert so_far(noisy, true, matches, asked=False) is None
 
 
 def test_swapping_the_sets_swaps_the_evidence(scene, noisy):

@@ -11,7 +11,7 @@ from biresnerf.refinement.adjustment.cameras import Cameras
 from biresnerf.refinement.finish.adjust_cameras import adjust_cameras
 from biresnerf.refinement.finish.expected_errors import TRACK_MODEL_ERROR
 from biresnerf.refinement.finish.outcome import Finish
-from biresnerf.refinement.start.first_step import poses_in_input_frame
+from biresnerf.refinement.start.refined_poses import RefinedPoses
 from biresnerf.refinement.verdict.judgement import judge_poses
 from biresnerf.refinement.verdict.pose_uncertainty import CONTRADICTED, NO_EVIDENCE, pose_uncertainty
 from tests.refinement.adjustment.rig import disturbed
@@ -38,7 +38,7 @@ def test_errors_in_the_callers_frame_and_unit_are_within_the_bounds(tmp_path, rn
     run, truth = noisy_run(tmp_path, rng)
     known = pose_uncertainty(run, adjust_cameras(run), None)
     assert {each.known_from for each in known} == {"matches"}
-    poses, _ = poses_in_input_frame(run.scene.dataset, run.optimiser)
+    poses = RefinedPoses.now(run.scene.dataset, run.optimiser).world_from_cam
     errors = pose_error(poses, truth).aligned
     for figure, limit in (
         (errors.rotation_deg, [each.rotation_deg for each in known]),
@@ -54,7 +54,7 @@ def test_errors_in_the_callers_frame_and_unit_are_within_the_bounds(tmp_path, rn
 def test_errors_along_the_axes_of_the_callers_world_are_as_large_as_the_covariance_says(tmp_path, rng):
     run, truth = noisy_run(tmp_path, rng)
     matrices = np.array([each.covariance for each in pose_uncertainty(run, adjust_cameras(run), None)])
-    poses, _ = poses_in_input_frame(run.scene.dataset, run.optimiser)
+    poses = RefinedPoses.now(run.scene.dataset, run.optimiser).world_from_cam
     frame = align_by_spread(truth, poses)
     errors = Cameras.of(frame.apply_to_poses(truth)).apart(Cameras.of(poses)).reshape(-1, 6)
     squares = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(matrices), errors)

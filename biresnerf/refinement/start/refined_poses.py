@@ -1,0 +1,64 @@
+"""From the optimisation's poses and lenses at a moment back to the input's frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.geometry.similarity import Similarity, align_by_spread, align_robust
+from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.parameters.intrinsics_parameters import IntrinsicsParameters
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedPoses:
+    """Poses and lenses of an optimisation at one moment.
+
+    Attributes:
+        world_from_cam: float64 [n, 4, 4], in the input's frame.
+        input_from_optimised: the similarity that carried them there.
+        lenses: as they were.
+        dataset: the input, seen through these lenses, at its own poses.
+    """
+
+    world_from_cam: Array
+    input_from_optimised: Similarity
+    lenses: IntrinsicsParameters
+    dataset: Dataset
+
+    @classmethod
+    def now(cls, dataset: Dataset, optimiser: JointOptimiser) -> RefinedPoses:
+        """Those of this moment."""
+        return cls._of(dataset, optimiser, optimiser.poses.poses().numpy(), optimiser.lenses)
+
+    @classmethod
+    def at(
+        cls, dataset: Dataset, optimiser: JointOptimiser, unit_from_cam: Array, increments: Tensor
+    ) -> RefinedPoses:
+        """Those of an earlier moment: poses [n, 4, 4] in the unit frame, and increments of the lenses."""
+        return cls._of(dataset, optimiser, unit_from_cam, optimiser.lenses.at(increments))
+
+    @classmethod
+    def _of(
+        cls, dataset: Dataset, optimiser: JointOptimiser, unit_from_cam: Array, lenses: IntrinsicsParameters
+    ) -> RefinedPoses:
+        """The optimisation leaves frame and scale free.
+
+        The similarity that fits the optimised poses to the given ones best fixes them; it is robust to lost cameras
+        unless the method says otherwise. Fixed cameras and rigs leave less free.
+        """
+        optimised = optimiser.frame.unit_from_world.inverse().apply_to_poses(unit_from_cam)
+        given, tied = dataset.world_from_cam, dataset.anchors
+        input_from_optimised = optimiser.bodies.input_from_optimised(optimised, given)
+        if input_from_optimised is None and optimiser.method.robust_frame:
+            input_from_optimised = align_robust(optimised[tied], given[tied], with_rotations=True)
+        elif input_from_optimised is None:
+            input_from_optimised = align_by_spread(optimised[tied], given[tied])
+        carried = optimiser.bodies.restored(input_from_optimised.apply_to_poses(optimised), given)
+        return cls(carried, input_from_optimised, lenses, lenses.refined(dataset))

@@ -1,0 +1,79 @@
+"""The poses that a run offers before its end: the best so far, by what can be measured on the way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.refinement.scene.scene import Scene
+from biresnerf.refinement.stages.best_so_far import BestSoFar
+from biresnerf.refinement.stages.two_stages import TwoStages
+from biresnerf.refinement.start.refined_poses import RefinedPoses
+from biresnerf.refinement.verdict.judgement import compare_without_training
+from biresnerf.refinement.verdict.verdict import EPIPOLAR_MATTERS, decide
+from biresnerf.report import Verdict
+
+UNMEASURED = (
+    "Nothing measures poses before the end of a run without feature matches: these are the latest ones."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class SoFar:
+    """What a run offers at one moment.
+
+    Attributes:
+        refined: the best refined poses so far; the latest where none were better than the input's yet.
+        verdict: on these; None where the options ask for none.
+    """
+
+    refined: RefinedPoses
+    verdict: Verdict | None
+
+    def offered(self, scene: Scene) -> tuple[NDArray[np.float64], Dataset]:
+        """Poses [n, 4, 4] and the set with their lenses: the input's, unless others are better."""
+        if self.verdict is not None and self.verdict.returned == "input":
+            return scene.dataset.world_from_cam, scene.dataset
+        return self.refined.world_from_cam, self.refined.dataset
+
+
+def poses_so_far(stages: TwoStages) -> SoFar:
+    """Measure the present poses, keep them if they are the best, and return the best.
+
+    The input's poses are the first candidate, and poses follow them that the verdict's rule returns. Later ones take
+    their place unless matches say that they are worse than the best ever measured, by as much as matters. No field is
+    trained for it: it takes as long as a few steps.
+    """
+    scene, optimiser, best = stages.scene, stages.optimiser, stages.record.best
+    now = RefinedPoses.now(scene.dataset, optimiser)
+    if not optimiser.options.verdict:
+        return SoFar(now, None)
+    verdict = _verdict(stages, now)
+    gain = 0.0 if verdict.epipolar is None else verdict.epipolar.error_px.difference
+    if verdict.returned == "refined" and (best is None or gain > best.gain - EPIPOLAR_MATTERS):
+        best = BestSoFar(
+            unit_from_cam=optimiser.poses.poses().numpy().copy(),
+            increments=optimiser.lenses.increments.detach().cpu().numpy().copy(),
+            verdict=verdict,
+            gain=gain if best is None else max(gain, best.gain),
+        )
+        stages.record = stages.record.model_copy(update={"best": best})
+        return SoFar(now, verdict)
+    if best is None:
+        return SoFar(now, verdict)
+    increments = torch.from_numpy(best.increments)
+    return SoFar(RefinedPoses.at(scene.dataset, optimiser, best.unit_from_cam, increments), best.verdict)
+
+
+def _verdict(stages: TwoStages, refined: RefinedPoses) -> Verdict:
+    """By all but unseen views; where that is nothing, refined poses are offered, as no rule can tell."""
+    lost = int(stages.optimiser.camera_errors.lost.sum())
+    findings = compare_without_training(stages.scene, refined, lost).findings
+    verdict = decide(findings)
+    if findings.failed or findings.epipolar is not None:
+        return verdict
+    return verdict.model_copy(update={"returned": "refined", "why": (UNMEASURED, *verdict.why)})
