@@ -73,6 +73,7 @@ class Forecast:
         self._earlier_s, self._began = 0.0, time.monotonic()
         self._phase: Phase | None = None
         self._phase_began = self._done = 0.0
+        self._later = 0.0  # amount of the phase that is done after other phases
         self._steps: dict[Unit, int] = {}
         self._measured: dict[Unit, float] = {}  # seconds that each rate was measured over
         self._fraction = 0.0
@@ -89,15 +90,16 @@ class Forecast:
     def within(self, phase: Phase, amount: float | None = None) -> Iterator[None]:
         """Around a phase, or so much of it: all that is left, if not given. Where it ends, its rate is known."""
         amount = self.left.get(phase, 0.0) if amount is None else amount
-        rest = max(0.0, self.left.get(phase, 0.0) - amount)
+        later = max(0.0, self.left.get(phase, 0.0) - amount)
         self.left[phase] = amount
         self.enter(phase)
+        self._later = later
         try:
             yield
             self.leave()
-            self.left[phase] = rest
+            self.left[phase] = later
         finally:
-            self._phase = None
+            self._phase, self._later = None, 0.0
 
     def enter(self, phase: Phase) -> None:
         """A phase begins, and with it the one before ends."""
@@ -152,10 +154,11 @@ class Forecast:
         if phase != self._phase or amount == 0:
             return expected
         elapsed = time.monotonic() - self._phase_began
+        later = self._later / amount * max(expected, elapsed)  # no faster than this part of the phase
         if self._done == 0:
-            return max(expected - elapsed, LATE * elapsed)
+            return later + max(expected - elapsed, LATE * elapsed)
         todo = 1 - self._done  # from what was expected to what is measured
-        return todo * (elapsed + todo * expected)
+        return later + todo * (elapsed + todo * expected)
 
     def left_s(self, instead: Mapping[Phase, float] | None = None) -> float:
         """Seconds to the end; with other amounts of work in some phases, if given."""

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
+import time
 
 import pytest
 
-from benchmarks.runs import shares, time_left
+from benchmarks.runs import anytime, shares, time_left
 from biresnerf.data.synthetic.scene import write_synthetic_scene
 
 pytestmark = pytest.mark.slow
@@ -57,3 +59,37 @@ def test_what_was_said_and_what_was_taken_are_of_the_same_phases(scene):
     assert early["fine"][1] > 0
     assert sum(actual for _, actual in early.values()) < seconds
     assert late.get("coarse", (0.0, 0.0))[1] == 0
+
+
+def test_by_the_processors_clock_a_run_is_predicted_as_well(scene):
+    before = time.monotonic
+    seconds, ratios, phases = time_left.told_and_taken(scene, "fast", 0.05, SMALL, "cpu")
+    assert time.monotonic is before
+    assert len(ratios) == len(time_left.SHARES)
+    assert 0 < sum(actual for _, actual in phases[0].values()) < seconds
+
+
+def test_the_processors_clock_counts_children_that_run_and_those_that_ended():
+    began, spins = (
+        time_left.processor_s(),
+        "import time\nwhile time.process_time() < 0.5: pass\nprint()\ninput()",
+    )
+    child = subprocess.Popen([sys.executable, "-c", spins], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    child.stdout.readline()
+    running = time_left.processor_s() - began
+    child.communicate(b"\n")
+    assert 0.45 < running < 1.5
+    assert running - 0.05 < time_left.processor_s() - began < 1.5
+
+
+def test_a_run_killed_at_once_leaves_nothing_and_a_stopped_one_its_poses(scene, tmp_path):
+    run = anytime.Run(scene, "fast", 0.05, 1, tuple(f"{key}={value}" for key, value in SMALL.items()))
+    truth = run.truth()
+    run.killed_after(0.2, tmp_path / "killed")
+    assert anytime.left_behind(tmp_path / "killed", truth).startswith(" no poses yet |")
+    run.refine(tmp_path / "whole")
+    rotation, centres, verdict, how_far = anytime.left_behind(tmp_path / "whole", truth).split("|")[:4]
+    assert 0 <= float(rotation.rstrip("° ")) < 10
+    assert centres.endswith("% ")
+    assert how_far == " complete "
+    assert verdict.strip()

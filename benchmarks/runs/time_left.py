@@ -2,16 +2,19 @@
 
 Each SET holds true poses, which get BARF's noise (0.15). Prints how long each run took, and at 10, 25, 50,
 75 and 90 % of that time the predicted seconds to the end over the actual ones. With ``--phases`` a second table says
-of each phase what it was predicted to take from these moments on, and what it took (predicted / actual, s).
+of each phase what it was predicted to take from these moments on, and what it took (predicted / actual, s). Nothing is
+remembered from earlier runs. With ``--clock cpu`` all seconds are processor time, COLMAP's included, of one thread: the
+forecast lives by that clock, so that others on the machine hardly matter.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import tempfile
 import time
 from bisect import bisect_right
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 from unittest import mock
@@ -19,13 +22,36 @@ from unittest import mock
 from biresnerf import pipeline
 from biresnerf.commands.settings_option import parse_settings
 from biresnerf.compile_kernels import compile_kernels
-from biresnerf.forecast import UNITS, Forecast, Phase, Unit
+from biresnerf.forecast import RATES, UNITS, Forecast, Phase, Unit
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.options.refine_options import parse_options
 from biresnerf.progress import Progress
 from biresnerf.studies.scenes import find_scene, read_scene, with_poses
 
 SHARES = (0.1, 0.25, 0.5, 0.75, 0.9)
+TICKS = os.sysconf("SC_CLK_TCK")
+
+
+def processor_s() -> float:
+    """Of this process and of its children, those that still run included."""
+    spent = os.times()
+    return time.process_time() + spent.children_user + spent.children_system + _of_children(os.getpid())
+
+
+def _of_children(pid: int) -> float:
+    """Of a process's children that run, and of theirs."""
+    total = 0.0
+    try:
+        for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
+            # The fields after the program's name: user and system time, and those of its children that ended.
+            fields = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
+            total += sum(map(int, fields[11:15])) / TICKS + _of_children(int(child))
+    except (FileNotFoundError, ProcessLookupError):  # it has ended just now
+        pass
+    return total
+
+
+CLOCKS: dict[str, Callable[[], float]] = {"wall": time.monotonic, "cpu": processor_s}
 
 
 class Watched(Forecast):
@@ -61,7 +87,7 @@ class Watched(Forecast):
 
 
 def told_and_taken(
-    path: Path, preset: str, noise: float, settings: Mapping[str, Any]
+    path: Path, preset: str, noise: float, settings: Mapping[str, Any], clock: str = "wall"
 ) -> tuple[float, list[float | None], list[dict[Phase, tuple[float, float]]]]:
     """The seconds of a run, the ratios of the time told and the time that was left, and both of each phase."""
     truth = read_scene(find_scene(path, 1, test_views=0))
@@ -72,15 +98,22 @@ def told_and_taken(
     def listen(progress: Progress) -> None:
         told.append((time.monotonic(), progress.eta_s))
 
-    began = time.monotonic()
+    def forecast(rates: Mapping[Unit, float]) -> Watched:
+        made.append(Watched(rates))
+        return made[-1]
+
+    if clock == "cpu":
+        settings = {"threads": 1, **settings}
     with (
         tempfile.TemporaryDirectory() as folder,
-        mock.patch.object(
-            pipeline, "Forecast", side_effect=lambda rates: made.append(Watched(rates)) or made[-1]
-        ),
+        mock.patch.object(time, "monotonic", CLOCKS[clock]),
+        mock.patch.object(pipeline, "Forecast", forecast),
+        mock.patch.object(pipeline, "remembered_rates", general_rates),
+        mock.patch.object(pipeline, "remember_rates"),
     ):
+        began = time.monotonic()
         pipeline.refine_poses(given, Path(folder), parse_options({"preset": preset, **settings}), listen)
-    seconds = time.monotonic() - began
+        seconds = time.monotonic() - began
     ratios: list[float | None] = []
     for share in SHARES:
         now = began + share * seconds
@@ -90,12 +123,18 @@ def told_and_taken(
     return seconds, ratios, [made[0].phases_at(began + share * seconds) for share in SHARES]
 
 
+def general_rates(_device: str, threads: int) -> dict[Unit, float]:
+    """Of a machine where nothing was measured yet."""
+    return {unit: rate / threads for unit, rate in RATES.items()}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("sets", nargs="+", type=Path)
     parser.add_argument("--preset", default="fast")
     parser.add_argument("--noise", type=float, default=0.15)
     parser.add_argument("--phases", action="store_true")
+    parser.add_argument("--clock", choices=list(CLOCKS), default="wall")
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="an option of the runs"
     )
@@ -105,7 +144,7 @@ def main() -> None:
     print("|---|---|" + "---|" * len(SHARES))
     for path in options.sets:
         settings = parse_settings(tuple(options.set))
-        seconds, ratios, phases = told_and_taken(path, options.preset, options.noise, settings)
+        seconds, ratios, phases = told_and_taken(path, options.preset, options.noise, settings, options.clock)
         cells = "".join(" - |" if ratio is None else f" {ratio:.2f} |" for ratio in ratios)
         print(f"| {path.name} | {seconds:.0f} |{cells}", flush=True)
         for phase in UNITS if options.phases else ():
