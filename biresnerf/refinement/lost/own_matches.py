@@ -88,6 +88,12 @@ class OwnMatches:
         return found.world_from_cam if better(camera, before, self.errors_px(poses)) else None
 
 
+def well_matched(tracks: Tracks, count: int) -> NDArray[np.bool_]:
+    """Which of `count` images have enough pairs to say something of their poses."""
+    pairs = np.bincount(tracks.image[np.concatenate(tracks.pairs())], minlength=count)
+    return np.asarray(pairs >= LEAST_PAIRS)
+
+
 def _medians(image: NDArray[np.int64], errors: Array, count: int) -> Array:
     """Median of the finite errors [m] of each of `count` images; NaN where there are too few."""
     finite = np.isfinite(errors)

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.model.dataset import GUESSES, Dataset
-from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.workload import JUDGING
 from biresnerf.geometry.focus import focus_point, rms_spread
 from biresnerf.geometry.pose_error import rotation_between_deg
@@ -22,11 +21,7 @@ from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.two_stages import TwoStages
 from biresnerf.refinement.start.refined_poses import RefinedPoses
 from biresnerf.refinement.verdict import image_flags
-from biresnerf.refinement.verdict.pose_evidence import (
-    EpipolarComparison,
-    compare_on_matches,
-    working_share,
-)
+from biresnerf.refinement.verdict.pose_evidence import compare_on_matches, errors_px, working_share
 from biresnerf.refinement.verdict.verdict import MEASURABLE_PX, Findings, decide, failed_checks, frame_doubt
 from biresnerf.refinement.views.compare_rigs import (
     BeforeAfter,
@@ -37,7 +32,7 @@ from biresnerf.refinement.views.compare_rigs import (
 )
 from biresnerf.refinement.views.held_out_views import ROUNDS_MOST
 from biresnerf.refinement.views.motion import moved_px
-from biresnerf.report import Verdict
+from biresnerf.report import EpipolarEvidence, Verdict
 
 logger = logging.getLogger(__name__)
 
@@ -123,7 +118,7 @@ def judge_poses(
         )  # fmt: skip
     took(heldout.work if heldout else 0.0)
     verdict = decide(replace(found.findings, heldout=heldout.evidence if heldout else None))
-    return _with_images(verdict, scene.images, optimiser, found, heldout)
+    return _with_images(verdict, scene, optimiser, found, heldout)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +136,6 @@ class Compared:
     placed: NDArray[np.bool_]
     turned: Array
     shifted: Array
-    epipolar: EpipolarComparison | None
     findings: Findings
 
 
@@ -155,7 +149,7 @@ def compare_without_training(scene: Scene, refined: RefinedPoses, lost: int) -> 
     spread = rms_spread(before.world_from_cam[:, :3, 3])
     grounded = sum(frame.pose_source not in GUESSED for frame in dataset.frames) > len(dataset) / 2
     failed = failed_checks(after.world_from_cam, lost)
-    epipolar: EpipolarComparison | None = None
+    epipolar: EpipolarEvidence | None = None
     moved = 0.0
     placed = np.array([frame.pose_source not in GUESSES for frame in dataset.frames])
     if np.isfinite(after.world_from_cam).all():
@@ -168,13 +162,13 @@ def compare_without_training(scene: Scene, refined: RefinedPoses, lost: int) -> 
         failed=failed,
         moved_px=moved,
         heldout=None,
-        epipolar=epipolar.evidence if epipolar else None,
+        epipolar=epipolar,
         compared_with=_source_of_poses(dataset),
         grounded=grounded,
         working_share=working_share(before, images),
         out_of_frame=frame_doubt(turned, shifted, spread) if grounded and not failed else "",
     )
-    return Compared(before, after, placed, turned, shifted, epipolar, findings)
+    return Compared(before, after, placed, turned, shifted, findings)
 
 
 def motion(before: Array, after: Array) -> tuple[Array, Array]:
@@ -192,16 +186,17 @@ def _source_of_poses(dataset: Dataset) -> Literal["given", "seeded", "mixed"]:
 
 def _with_images(
     verdict: Verdict,
-    images: ImageSet,
+    scene: Scene,
     optimiser: JointOptimiser,
     found: Compared,
     heldout: HeldOutComparison | None,
 ) -> Judgement:
+    images = scene.images
     trial_psnr, epipolar_px = np.full((2, len(images)), np.nan), np.full((2, len(images)), np.nan)
     if heldout is not None:
         trial_psnr[:, heldout.views] = heldout.before.psnr, heldout.after.psnr
-    if found.epipolar is not None:
-        epipolar_px[:] = found.epipolar.before, found.epipolar.after
+    if found.findings.epipolar is not None and scene.tracks is not None:
+        epipolar_px[:] = errors_px(found.before, found.after, scene.tracks)
     before = found.before.world_from_cam
     sharpness = image_flags.sharpness(images, before)
     gain = image_flags.gains(optimiser)

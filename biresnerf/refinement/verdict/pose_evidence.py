@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.refinement.adjustment.paired import paired
-from biresnerf.refinement.lost.own_matches import LEAST_PX, OwnMatches
+from biresnerf.refinement.lost.own_matches import LEAST_PX, OwnMatches, well_matched
 from biresnerf.refinement.verdict.verdict import EPIPOLAR_MATTERS
 from biresnerf.refinement.views.compare_rigs import Rig
 from biresnerf.report import EpipolarEvidence
@@ -20,18 +18,9 @@ Array = NDArray[np.float64]
 LEAST_MATCHED = 4  # images
 
 
-@dataclass(frozen=True, eq=False)
-class EpipolarComparison:
-    """Median error of all of each image's matches [n] (px, full size) with either rig; NaN where it has too few."""
-
-    before: Array
-    after: Array
-    evidence: EpipolarEvidence
-
-
 def compare_on_matches(
     before: Rig, after: Rig, tracks: Tracks, placed: NDArray[np.bool_], *, started_from_matches: bool
-) -> EpipolarComparison | None:
+) -> EpipolarEvidence | None:
     """Each image's median epipolar error with either rig; None where too few images have matches.
 
     The evidence is of points that were left out of every estimate, where they know half of the images that all points
@@ -41,15 +30,12 @@ def compare_on_matches(
         placed: which images [n] had more than a guess for a pose before.
         started_from_matches: whether points not left out had a part in the rig `after`.
     """
-    old, new = _errors_px(before, after, tracks)
     counted = placed if placed.any() else ~placed
-    judging, figures = tracks.split()[1], (old, new)
-    if judging is not None:
-        left_out = _errors_px(before, after, judging)
-        enough = max(LEAST_MATCHED, _known(figures, counted).sum() / 2)
-        judging, figures = (
-            (judging, left_out) if _known(left_out, counted).sum() >= enough else (None, figures)
-        )
+    enough = max(LEAST_MATCHED, int((well_matched(tracks, len(placed)) & counted).sum()) / 2)
+    judging = tracks.split()[1]
+    figures = errors_px(before, after, judging) if judging is not None else None
+    if figures is None or _known(figures, counted).sum() < enough:
+        judging, figures = None, errors_px(before, after, tracks)
     known = _known(figures, counted)
     if known.sum() < LEAST_MATCHED:
         return None
@@ -58,16 +44,16 @@ def compare_on_matches(
     comparison = paired(one, other, EPIPOLAR_MATTERS, gains)
     medians = {"before": float(np.median(one)), "after": float(np.median(other))}
     sides = [max(camera.width, camera.height) for camera in after.cameras]
-    evidence = EpipolarEvidence(
+    return EpipolarEvidence(
         matches=len((judging or tracks).pairs()[0]),
         independent=judging is not None or not started_from_matches,
         error_px=comparison.model_copy(update=medians),
         share_of_image=medians["after"] / float(np.median(sides)),
     )
-    return EpipolarComparison(old, new, evidence)
 
 
-def _errors_px(before: Rig, after: Rig, tracks: Tracks) -> tuple[Array, Array]:
+def errors_px(before: Rig, after: Rig, tracks: Tracks) -> tuple[Array, Array]:
+    """Each image's median error [n] with either rig (px, full size); NaN where it has too few matches."""
     old, new = (OwnMatches(tracks, rig.cameras).errors_px(rig.world_from_cam) for rig in (before, after))
     return old, new
 

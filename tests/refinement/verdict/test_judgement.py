@@ -248,7 +248,7 @@ def test_matches_of_points_left_out_judge_and_photos_placed_by_a_guess_do_not(sc
 
     def found(placed: np.ndarray, tracks: Tracks, *, started: bool) -> EpipolarEvidence:
         rigs = Rig(before, cameras), Rig(worse, cameras)
-        return compare_on_matches(*rigs, tracks, placed, started_from_matches=started).evidence
+        return compare_on_matches(*rigs, tracks, placed, started_from_matches=started)
 
     judged_by_all = found(~guessed, tracks, started=True)
     assert judged_by_all.error_px.finding != "better"
