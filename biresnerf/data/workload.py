@@ -127,11 +127,16 @@ def after_steps(
     pictured = picture_share(options.trial_steps, unbounded=unbounded)
     return {
         "adjusting": adjusting,
-        "checking": PHOTO_TRIALS * trial if checks else 0.0,
+        "checking": photo_check(options, unbounded=unbounded) if checks else 0.0,
         "evaluating": OPEN_EVALUATION if unbounded else 1.0,
         # the first look of the first round decides mostly, and its fields are trained on for their pictures
         "judging": options.verdict * (JUDGING + pictured * trial),
     }
+
+
+def photo_check(options: ResolvedOptions, *, unbounded: bool) -> float:
+    """Work of the trainings by which photos judge adjusted cameras."""
+    return PHOTO_TRIALS * _trial(options.trial_steps, unbounded=unbounded)
 
 
 def _search(dataset: Dataset, effort: SeedingEffort) -> tuple[float, float, float]:

@@ -30,7 +30,7 @@ class Seen:
 
     Attributes:
         names: of the images.
-        after, before: world_from_cam [n, 4, 4]: as they are now, or refined, and as given; NaN where there is none.
+        after, before: world_from_cam [n, 4, 4]: the best so far, or refined, and as given; NaN where there is none.
         cameras: each image's, at full size.
         points, colours: [m, 3] in the input's world, and uint8 [m, 3].
         said: how far the run is, or how it ended.

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.workload import PHOTO_TRIALS
+from biresnerf.data.workload import PHOTO_TRIALS, photo_check
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.similarity import align_robust
 from biresnerf.refinement.stages.two_stages import TwoStages
@@ -57,10 +57,11 @@ def photos_object(stages: TwoStages, unit_from_cam: NDArray[np.float64], cameras
         logger.info("the adjusted cameras moved by %.2f px, which photos do not show", moved)
         return False
     stages.announce("checking the adjusted cameras by the photos")
-    with stages.timed("adjusting", "checking"):
+    work = photo_check(optimiser.options, unbounded=optimiser.frame.unbounded)  # known by now, if not before
+    with stages.timed("adjusting", "checking", work):
         found = compare_placed(
             present, other, scene, optimiser, ~scene.start.guessed, stages.monitor.should_stop,
-            effort=Effort(PHOTO_TRIALS, rounds_most=1, looks=(1.0,)),
+            stages.forecast.advance, Effort(PHOTO_TRIALS, rounds_most=1, looks=(1.0,)),
         )  # fmt: skip
         stages.forecast.took(found.work if found else 0.0)
     if found is None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from biresnerf.data.workload import photo_check
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.rigid import rigid_inverse
@@ -252,11 +253,18 @@ def test_fields_are_trained_only_where_patches_of_the_photos_have_not_spoken(
 def test_no_field_is_trained_where_cameras_moved_by_less_than_photos_show(tmp_path, rng, monkeypatch):
     run, _ = stages(tmp_path, rng)
     present, trained = run.optimiser.poses.poses().numpy(), []
-    monkeypatch.setattr(photo_trial, "compare_placed", lambda *_, effort: trained.append(effort.looks))
-    for deviation, expected in ((1e-4, []), (0.1, [(1.0,)])):
+    forecast = run.forecast
+    monkeypatch.setattr(
+        photo_trial,
+        "compare_placed",
+        lambda *given: trained.append((given[-1].looks, forecast.left["checking"])),
+    )
+    work = photo_check(run.optimiser.options, unbounded=run.optimiser.frame.unbounded)
+    for deviation, expected in ((1e-4, []), (0.1, [((1.0,), work)])):
         other = disturbed(present, rng, deviation, deviation)
         assert not photo_trial.photos_object(run, other, run.scene.dataset.cameras)
-        assert trained == expected
+        assert trained == expected, "and it is known how long that takes"
+        assert not forecast.left.get("checking")
 
 
 def test_the_accuracy_of_the_input_is_measured_where_poses_were_given(tmp_path, rng):
