@@ -70,10 +70,10 @@ def poses_so_far(stages: TwoStages) -> SoFar:
 
 
 def _verdict(stages: TwoStages, refined: RefinedPoses) -> Verdict:
-    """By all but unseen views; where that is nothing, refined poses are offered, as no rule can tell."""
+    """By all but unseen views; where nothing else speaks for or against them, refined poses are offered."""
     lost = int(stages.optimiser.camera_errors.lost.sum())
     findings = compare_without_training(stages.scene, refined, lost).findings
     verdict = decide(findings)
-    if findings.failed or findings.epipolar is not None:
+    if findings.epipolar is not None or verdict.verdict != "inconclusive":
         return verdict
     return verdict.model_copy(update={"returned": "refined", "why": (UNMEASURED, *verdict.why)})

@@ -59,8 +59,11 @@ class Wandering:
 
     def at(self, noise: float) -> SoFar:
         """What is offered with the optimiser's poses at this noise."""
-        unit = self.stages.optimiser.frame.unit_from_world.apply_to_poses(self.noisy(noise))
-        self.stages.place(unit)
+        return self.at_poses(self.noisy(noise))
+
+    def at_poses(self, world_from_cam: np.ndarray) -> SoFar:
+        """The same at any poses [n, 4, 4]."""
+        self.stages.place(self.stages.optimiser.frame.unit_from_world.apply_to_poses(world_from_cam))
         return poses_so_far(self.stages)
 
     def error_deg(self, offered: SoFar) -> float:
@@ -144,6 +147,15 @@ def test_without_matches_the_latest_poses_are_offered_and_it_is_said_that_nothin
         assert offered.verdict.why[0] == UNMEASURED
         poses, _ = offered.offered(run.stages.scene)
         assert pose_error(poses, run.noisy(noise)).aligned_robust.rotation_deg.max < 1e-3
+
+
+def test_without_matches_poses_that_lost_the_inputs_frame_are_not_offered(scene, tmp_path):
+    run = Wandering(scene, tmp_path, 0.1, matches=None)
+    upside_down = run.truth.world_from_cam.copy()
+    upside_down[: VIEWS // 2 + 1, :3, :3] = upside_down[: VIEWS // 2 + 1, :3, :3] @ np.diag([-1.0, 1, -1])
+    offered = run.at_poses(upside_down)
+    assert (offered.verdict.verdict, offered.verdict.returned) == ("failed_check", "input")
+    np.testing.assert_array_equal(offered.offered(run.stages.scene)[0], run.dataset.world_from_cam)
 
 
 def test_a_run_that_is_to_have_no_verdict_offers_the_latest_poses(scene, tmp_path):
