@@ -220,9 +220,8 @@ def _first_step(scene: Scene, origin: RunOrigin, setup: _Setup, observer: Observ
     stages = TwoStages(optimiser, scene, setup.folder.path, origin, setup.monitor, observer)
     if setup.earlier is not None:
         stages.restore(setup.earlier)
-        poses_so_far(
-            stages
-        )  # a partial result may hold these poses, which were measured after the checkpoint
+        # A partial result may hold these poses: they were measured after the checkpoint was written.
+        poses_so_far(stages)
         setup.monitor.report(Progress(stage="preparing", message=f"resuming at step {optimiser.step_index}"))
     expect_rest(stages)
     return stages

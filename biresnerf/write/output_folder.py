@@ -67,6 +67,10 @@ class OutputFolder:
         with suppress(OSError):  # not empty, or never made
             self.path.rmdir()
 
+    def remove_refined(self) -> None:
+        """Remove refined poses beside those of the result."""
+        shutil.rmtree(self.path / REFINED, ignore_errors=True)
+
     def clean_up(self) -> None:
         """Remove what only an unfinished run needs, and what others could start from unless that is to be kept."""
         shutil.rmtree(self.preview, ignore_errors=True)

@@ -71,6 +71,7 @@ def write_result(
     surface = evaluation.surface(optimiser.frame.unit_from_world, found.input_from_optimised)
     field = FieldPoints(*surface, refined) if np.isfinite(refined).all() else None
     returned, returned_dataset, poses, moved = refined, refined_dataset, POSES, None
+    folder.remove_refined()  # of a partial result that this one follows
     verdict = report.verdict or report.verdict_so_far
     if verdict is not None and verdict.returned == "input":
         returned, returned_dataset = scene.dataset.world_from_cam, scene.dataset

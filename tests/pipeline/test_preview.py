@@ -94,7 +94,7 @@ def test_a_preview_and_what_a_stopped_run_leaves_hold_the_best_poses_and_not_the
 
     def wandering_step(optimiser: JointOptimiser) -> StepResult:
         result = real_step(optimiser)
-        poses = perturb_poses(truth.world_from_cam, (0.01, 0.05)[bool(seen)], seed=1)
+        poses = perturb_poses(truth.world_from_cam, (0.3, 0.01, 0.05, 0.05)[min(len(seen), 3)], seed=1)
         unit = optimiser.frame.unit_from_world.apply_to_poses(poses)
         optimiser.poses.place(torch.from_numpy(unit))
         return result
@@ -109,16 +109,18 @@ def test_a_preview_and_what_a_stopped_run_leaves_hold_the_best_poses_and_not_the
             seen.append(error_deg(output / "preview"))
 
     monkeypatch.setattr(two_stages, "step_that_fits", wandering_step)
-    for so_many in (2, 3):  # in the run, and in the one that goes on from it
+    given_deg = error_deg_of(given, truth)
+    for so_many, returned in ((1, "input"), (3, "refined"), (4, "refined")):  # each goes on from the last
         with pytest.raises(Interrupted):
             refine_poses(given, output, OPTIONS, listen, lambda: len(seen) >= so_many)  # noqa: B023
         report = Report.model_validate_json((output / "report.json").read_text())
-        assert (report.state, report.verdict) == ("partial", None)
-        assert (report.verdict_so_far.verdict, report.verdict_so_far.returned) == ("improved", "refined")
-        assert error_deg(output) == pytest.approx(seen[0], abs=1e-4)
-    assert report.resumed == 1
-    assert seen == pytest.approx([seen[0]] * 3, abs=1e-4)
-    assert seen[0] < error_deg_of(given, truth) / 5
+        assert (report.state, report.verdict, report.verdict_so_far.returned) == ("partial", None, returned)
+        assert error_deg(output) == pytest.approx(seen[-1], abs=1e-4)
+        assert (output / "refined").is_dir() == (returned == "input"), "the latest beside the input's"
+    assert report.resumed == 2
+    assert report.verdict_so_far.verdict == "improved"
+    assert seen == pytest.approx([given_deg, *[seen[1]] * 3], abs=1e-4)
+    assert seen[1] < given_deg / 5
 
 
 def error_deg_of(given: Dataset, truth: Dataset) -> float:
