@@ -53,8 +53,9 @@ def test_a_set_that_fails_is_named_and_the_others_go_on(scene, tmp_path, monkeyp
 
 
 def test_what_was_said_and_what_was_taken_are_of_the_same_phases(scene):
-    seconds, ratios, phases = time_left.told_and_taken(scene, "fast", 0.05, SMALL)
-    assert len(ratios) == len(phases) == len(time_left.SHARES)
+    seconds, ratios, phases, work = time_left.told_and_taken(scene, "fast", 0.05, SMALL)
+    assert len(ratios) == len(phases) == len(work) == len(time_left.SHARES)
+    assert 0.8 < max(work) < 1.25, "what a run without matches has before it is known, once it is read"
     early, late = phases[0], phases[-1]
     assert early["fine"][1] > 0
     assert sum(actual for _, actual in early.values()) < seconds
@@ -63,7 +64,7 @@ def test_what_was_said_and_what_was_taken_are_of_the_same_phases(scene):
 
 def test_by_the_processors_clock_a_run_is_predicted_as_well(scene):
     before = time.monotonic
-    seconds, ratios, phases = time_left.told_and_taken(scene, "fast", 0.05, SMALL, "cpu")
+    seconds, ratios, phases, _ = time_left.told_and_taken(scene, "fast", 0.05, SMALL, "cpu")
     assert time.monotonic is before
     assert len(ratios) == len(time_left.SHARES)
     assert 0 < sum(actual for _, actual in phases[0].values()) < seconds

@@ -2,7 +2,8 @@
 
 Each SET holds true poses, which get BARF's noise (0.15). Prints how long each run took, and at 10, 25, 50,
 75 and 90 % of that time the predicted seconds to the end over the actual ones. With ``--phases`` a second table says
-of each phase what it was predicted to take from these moments on, and what it took (predicted / actual, s). Nothing is
+of each phase what it was predicted to take from these moments on, and what it took (predicted / actual, s); its row
+``work`` holds the ratio of the amounts of work alone, at the general rates, which no load changes. Nothing is
 remembered from earlier runs. With ``--clock cpu`` all seconds are processor time, COLMAP's included, of one thread: the
 forecast lives by that clock, so that others on the machine hardly matter.
 """
@@ -61,6 +62,10 @@ class Watched(Forecast):
         super().__init__(rates)
         self.said: list[tuple[float, dict[Phase, float], dict[Phase, float]]] = []
         self.taken: dict[Phase, float] = {}
+        self.worked: dict[Phase, float] = {}
+        self.amounts: list[
+            tuple[float, float, float]
+        ] = []  # when, work left and done, s at the general rates
 
     def enter(self, phase: Phase) -> None:
         super().enter(phase)
@@ -69,15 +74,28 @@ class Watched(Forecast):
     def leave(self) -> None:
         if self._phase is not None:
             self.taken[self._phase] = self.taken.get(self._phase, 0.0) + time.monotonic() - self._entered
+            self.worked[self._phase] = self.worked.get(self._phase, 0.0) + self.left.get(self._phase, 0.0)
         super().leave()
 
     def stepped(self, stage: Literal["coarse", "fine"], seconds: float) -> None:
         self.taken[stage] = self.taken.get(stage, 0.0) + seconds
+        self.worked[stage] = self.worked.get(stage, 0.0) + self.step_weights[stage]
         super().stepped(stage, seconds)
 
     def now(self) -> tuple[float, float | None]:
-        self.said.append((time.monotonic(), {p: self.seconds(p) for p in self.left}, dict(self.taken)))
+        when, phase = time.monotonic(), self._phase
+        self.said.append((when, {p: self.seconds(p) for p in self.left}, dict(self.taken)))
+        left, done = dict(self.left), dict(self.worked)
+        if phase is not None and phase in left:
+            done[phase] = done.get(phase, 0.0) + self._done * left[phase]
+            left[phase] = (1 - self._done) * left[phase] + self._later
+        self.amounts.append((when, at_general_rates(left), at_general_rates(done)))
         return super().now()
+
+    def work_at(self, moment: float) -> float:
+        """Once the run is over: the amount of work that was predicted from a moment on over the actual one."""
+        _, left, done = self.amounts[max(0, bisect_right([when for when, _, _ in self.amounts], moment) - 1)]
+        return left / max(at_general_rates(self.worked) - done, 1e-9)
 
     def phases_at(self, moment: float) -> dict[Phase, tuple[float, float]]:
         """Of each phase, once the run is over: the seconds from a moment on, predicted and actual."""
@@ -88,8 +106,8 @@ class Watched(Forecast):
 
 def told_and_taken(
     path: Path, preset: str, noise: float, settings: Mapping[str, Any], clock: str = "wall"
-) -> tuple[float, list[float | None], list[dict[Phase, tuple[float, float]]]]:
-    """The seconds of a run, the ratios of the time told and the time that was left, and both of each phase."""
+) -> tuple[float, list[float | None], list[dict[Phase, tuple[float, float]]], list[float]]:
+    """The seconds of a run, the ratios of the time told and the time that was left, both of each phase, and of work."""
     truth = read_scene(find_scene(path, 1, test_views=0))
     given = with_poses(truth, perturb_poses(truth.world_from_cam, noise, seed=1))
     told: list[tuple[float, float | None]] = []
@@ -120,7 +138,13 @@ def told_and_taken(
         at, eta_s = told[max(0, bisect_right([when for when, _ in told], now) - 1)]
         left_s = None if eta_s is None else eta_s - (now - at)
         ratios.append(None if left_s is None else left_s / ((1 - share) * seconds))
-    return seconds, ratios, [made[0].phases_at(began + share * seconds) for share in SHARES]
+    moments = [began + share * seconds for share in SHARES]
+    return seconds, ratios, [*map(made[0].phases_at, moments)], [*map(made[0].work_at, moments)]
+
+
+def at_general_rates(amounts: Mapping[Phase, float]) -> float:
+    """Seconds of one core that these amounts of work take."""
+    return sum(amount * RATES[UNITS[phase]] for phase, amount in amounts.items())
 
 
 def general_rates(_device: str, threads: int) -> dict[Unit, float]:
@@ -144,13 +168,17 @@ def main() -> None:
     print("|---|---|" + "---|" * len(SHARES))
     for path in options.sets:
         settings = parse_settings(tuple(options.set))
-        seconds, ratios, phases = told_and_taken(path, options.preset, options.noise, settings, options.clock)
+        seconds, ratios, phases, work = told_and_taken(
+            path, options.preset, options.noise, settings, options.clock
+        )
         cells = "".join(" - |" if ratio is None else f" {ratio:.2f} |" for ratio in ratios)
         print(f"| {path.name} | {seconds:.0f} |{cells}", flush=True)
         for phase in UNITS if options.phases else ():
             both = (found.get(phase) for found in phases)
             cells = "".join(" |" if one is None else f" {one[0]:.1f} / {one[1]:.1f} |" for one in both)
             print(f"| | {phase} |{cells}", flush=True)
+        if options.phases:
+            print("| | work |" + "".join(f" {ratio:.2f} |" for ratio in work), flush=True)
 
 
 if __name__ == "__main__":
