@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import math
+import weakref
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -89,7 +90,8 @@ class StepGraphs:
     def __init__(
         self, optimiser: JointOptimiser, record: Record = cuda_graph, check: Check = graph_faults
     ) -> None:
-        self.optimiser = optimiser
+        # Not kept alive: an optimiser that is dropped frees its device's memory at once.
+        self.optimiser: JointOptimiser = weakref.proxy(optimiser)
         self.fault: str | None = None
         self.repeated = 0
         self._record, self._check = record, check

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -236,6 +238,18 @@ def test_a_step_that_waits_for_a_value_is_not_recorded(tiny):
     steps((optimiser,), [40] * 5)
     assert "cannot wait for a value" in slower_steps(optimiser)[0]
     assert optimiser.step_index == 5
+
+
+def test_a_dropped_optimiser_frees_its_memory_at_once(tiny):
+    optimiser = made(tiny)
+    steps((optimiser,), [40] * 5)
+    held = weakref.ref(optimiser)
+    gc.disable()
+    try:
+        del optimiser
+        assert held() is None
+    finally:
+        gc.enable()
 
 
 def test_sizes_of_steps_are_few_and_near_any_number_of_rays():
