@@ -191,8 +191,10 @@ def _seed(dataset: Dataset, setup: _Setup) -> tuple[Scene, RunOrigin]:
         start, tracks = earlier.start, earlier.tracks
     else:
         folder.path.mkdir(parents=True, exist_ok=True)
-        start = find_start(seeding.candidates, images, options, setup.device, setup.threads, monitor)
         tracks = Tracks.load(folder.path / TRACKS, dataset.names)
+        start = find_start(
+            seeding.candidates, seeding.dataset, images, tracks, options, setup.device, setup.threads, monitor
+        )
     held_out = held_out_views(len(dataset), options.holdout, start.reliable)
     return Scene(seeding.dataset, images, start, held_out, tracks), origin
 

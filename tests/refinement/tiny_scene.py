@@ -10,6 +10,7 @@ import torch
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.images import ImageSet, load_images
+from biresnerf.data.points.tracks import Tracks
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.data.synthetic.scene import write_synthetic_scene
 from biresnerf.errors import Interrupted
@@ -72,6 +73,23 @@ def given_scene(
     poses = dataset.world_from_cam if given is None else given
     start = InitialPoses(poses, "given", ("given",) * len(dataset))
     return Scene(dataset, images, start, held_out or [])
+
+
+def true_matches(dataset: Dataset, noise_px: float = 0.1) -> Tracks:
+    """Where random points of the scene lie in pairs of photos, by the true poses, and noise."""
+    rng, views = np.random.default_rng(7), len(dataset)
+    points = rng.uniform(-0.5, 0.5, (600, 3))
+    pair = rng.integers(0, views, (600, 2))
+    pair[:, 1] = (pair[:, 0] + 1 + pair[:, 1] % (views - 1)) % views
+    full = dataset.camera_of(0).full()
+    xy = np.empty((600, 2, 2))
+    for side in (0, 1):
+        poses = dataset.world_from_cam[pair[:, side]]
+        in_cam = np.einsum("mji,mj->mi", poses[:, :3, :3], points - poses[:, :3, 3])
+        xy[:, side] = in_cam[:, :2] / in_cam[:, 2:] * [full.fx, full.fy] + [full.cx, full.cy]
+    tracks = Tracks.of_matches(pair, xy + rng.normal(0, noise_px, xy.shape))
+    assert tracks is not None
+    return tracks
 
 
 def finished(stages: TwoStages) -> bool:

@@ -16,9 +16,10 @@ from biresnerf.progress import Monitor
 from biresnerf.refinement.start import choose_start as start_module
 from biresnerf.refinement.start.choose_start import choose_start, find_start
 from biresnerf.refinement.start.first_step import pose_mobility, stage_lengths
+from biresnerf.refinement.start.matches_explained import matches_explained
 from biresnerf.refinement.views import pose_trials
 from biresnerf.refinement.views.pose_trials import PoseTrials, trial_views
-from tests.refinement.tiny_scene import CPU, tiny_options, tiny_set
+from tests.refinement.tiny_scene import CPU, tiny_options, tiny_set, true_matches
 
 pytestmark = pytest.mark.slow
 
@@ -45,7 +46,7 @@ def candidates(dataset, first: np.ndarray, second: np.ndarray) -> list[InitialPo
 
 
 def choose(images, tried: list[InitialPoses]) -> InitialPoses:
-    return choose_start(tried, images, tiny_options(), CPU, 2, lambda: False)
+    return choose_start(tried, images, [0.0] * len(tried), tiny_options(), CPU, 2, lambda: False)
 
 
 def test_good_matches_win_over_noisy_given_poses(scene):
@@ -64,8 +65,46 @@ def test_trials_end_once_one_is_clearly_better(scene, monkeypatch):
     truth, works = dataset.world_from_cam, []
     for other in (perturb_poses(truth, 0.3, seed=1), truth):
         tried = candidates(dataset, other, truth)
-        choose_start(tried, images, tiny_options(), CPU, 2, lambda: False, works.append)
+        choose_start(tried, images, [0.0, 0.0], tiny_options(), CPU, 2, lambda: False, works.append)
     assert works == [2 * 240 / 4, 2 * (240 + 150)]
+
+
+def test_trials_end_once_photos_prefer_poses_that_alone_explain_the_matches(scene, monkeypatch):
+    monkeypatch.setattr(start_module, "TRIAL_STEPS", 240)
+    monkeypatch.setattr(start_module, "CLEAR_DB", 50.0)
+    dataset, images = scene
+    truth, tracks = dataset.world_from_cam, true_matches(dataset, noise_px=0.01)
+    noisy = perturb_poses(truth, 0.3, seed=1)
+    works = []
+
+    def chosen(first: np.ndarray, second: np.ndarray) -> str:
+        tried = candidates(dataset, first, second)
+        explained = [matches_explained(dataset, tracks, c.world_from_cam) for c in tried]
+        return choose_start(
+            tried, images, explained, tiny_options(), CPU, 2, lambda: False, works.append
+        ).source
+
+    assert chosen(noisy, truth) == "matches-incremental"
+    assert chosen(truth, noisy) == "given"
+    assert chosen(truth, truth.copy()) == "given"  # both explain them, and no training tells them apart
+    assert works == [2 * 240 / 4] * 3
+    wrong = perturb_poses(truth, 0.3, seed=2)
+    chosen(noisy, wrong)  # neither explains them
+    assert works[-1] == 2 * (240 + 150)
+
+
+def test_right_poses_explain_matches_and_wrong_or_unmatched_ones_do_not(scene):
+    dataset = scene[0]
+    truth, tracks = dataset.world_from_cam, true_matches(dataset, noise_px=0.01)
+    assert matches_explained(dataset, tracks, truth) > 0.95
+    assert matches_explained(dataset, tracks, perturb_poses(truth, 0.05, seed=1)) < 0.2
+    folded = truth.copy()
+    folded[6:] = truth[:3]  # a third of the views stand where others do
+    assert matches_explained(dataset, tracks, folded) < 0.7
+    of_six = tracks.where(tracks.image < 6)
+    assert matches_explained(dataset, of_six, truth) == pytest.approx(
+        6 / 9, abs=0.05
+    )  # three photos unmatched
 
 
 def test_good_given_poses_win_over_wrong_matches(scene):
@@ -83,7 +122,7 @@ def test_good_given_poses_win_over_wrong_matches(scene):
 def test_without_matches_no_matched_poses_are_remembered(scene):
     dataset, images = scene
     given = InitialPoses(dataset.world_from_cam, "given", ("given",) * VIEWS)
-    found = find_start([given], images, tiny_options(), CPU, 2, Monitor())
+    found = find_start([given], dataset, images, None, tiny_options(), CPU, 2, Monitor())
     assert found.matched_poses is None
     kept = TypeAdapter(InitialPoses).validate_json(TypeAdapter(InitialPoses).dump_json(found))
     assert kept.matched_poses is None
@@ -170,7 +209,7 @@ def test_a_stop_ends_the_trial(scene):
     dataset, images = scene
     tried = candidates(dataset, dataset.world_from_cam, dataset.world_from_cam)
     with pytest.raises(Interrupted):
-        choose_start(tried, images, tiny_options(), CPU, 2, lambda: True)
+        choose_start(tried, images, [0.0, 0.0], tiny_options(), CPU, 2, lambda: True)
 
 
 def test_a_start_survives_its_checkpoint(scene):

@@ -19,7 +19,14 @@ from biresnerf.refinement.views.compare_rigs import Rig
 from biresnerf.refinement.views.held_out_views import held_out_views, unseen_rounds, unseen_views
 from biresnerf.refinement.views.motion import moved_px
 from biresnerf.report import EpipolarEvidence
-from tests.refinement.tiny_scene import CPU, given_scene, tiny_optimiser, tiny_options, tiny_set
+from tests.refinement.tiny_scene import (
+    CPU,
+    given_scene,
+    tiny_optimiser,
+    tiny_options,
+    tiny_set,
+    true_matches,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -40,21 +47,6 @@ def noisy(scene):
 def with_poses(dataset: Dataset, poses: np.ndarray) -> Dataset:
     frames = tuple(replace(f, world_from_cam=p) for f, p in zip(dataset.frames, poses, strict=True))
     return replace(dataset, frames=frames)
-
-
-def true_matches(dataset: Dataset) -> Tracks:
-    """Where random points of the scene lie in pairs of photos, by the true poses; to half a pixel."""
-    rng = np.random.default_rng(7)
-    points = rng.uniform(-0.5, 0.5, (600, 3))
-    pair = rng.integers(0, VIEWS, (600, 2))
-    pair[:, 1] = (pair[:, 0] + 1 + pair[:, 1] % (VIEWS - 1)) % VIEWS
-    full = dataset.camera_of(0).full()
-    xy = np.empty((600, 2, 2))
-    for side in (0, 1):
-        poses = dataset.world_from_cam[pair[:, side]]
-        in_cam = np.einsum("mji,mj->mi", poses[:, :3, :3], points - poses[:, :3, 3])
-        xy[:, side] = in_cam[:, :2] / in_cam[:, 2:] * [full.fx, full.fy] + [full.cx, full.cy]
-    return Tracks.of_matches(pair, xy + rng.normal(0, 0.1, xy.shape))
 
 
 def judged(

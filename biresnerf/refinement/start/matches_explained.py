@@ -1,0 +1,37 @@
+"""How much of the feature matches that no mapping was shown a set of poses explains."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.points.tracks import Tracks
+from biresnerf.geometry.camera.camera import Intrinsics
+from biresnerf.geometry.epipolar import epipolar_angles
+from biresnerf.refinement.scene.scene_depth import track_rays
+
+EXPLAINED_WITHIN = 0.003  # of the photo's long side: 3 px of 1000
+
+
+def matches_explained(dataset: Dataset, tracks: Tracks, world_from_cam: NDArray[np.float64]) -> float:
+    """Share of a photo's left-out matches whose epipolar error at poses [n, 4, 4] is small: the mean over photos.
+
+    Photos without any count as 0. A model that folds a symmetric thing is consistent with the matches it was made of
+    mostly because it leaves out the others; here these count, and so do those of cameras that it does not place.
+    """
+    left_out = tracks.split()[1]
+    if left_out is None:
+        return 0.0
+    cameras = [dataset.camera_of(i) for i in range(len(dataset))]
+    intrinsics = Intrinsics.from_cameras(cameras)
+    focal_px = ((intrinsics.fx + intrinsics.fy) / 2).numpy()
+    allowed = EXPLAINED_WITHIN * np.array([max(c.width, c.height) for c in cameras]) / focal_px
+    rays, (one, other) = track_rays(intrinsics, left_out), left_out.pairs()
+    a, b = left_out.image[one], left_out.image[other]
+    angles = epipolar_angles(world_from_cam, a, b, rays[one], rays[other])
+    fits = angles < (allowed[a] + allowed[b]) / 2  # false where the angle is not known
+    photos = np.concatenate([a, b])
+    known = np.bincount(photos, minlength=len(cameras))
+    agree = np.bincount(photos, np.tile(fits, 2), minlength=len(cameras))
+    return float((agree / np.maximum(known, 1)).mean())
