@@ -29,8 +29,9 @@ LEAST_ADJUSTED, MOST_ADJUSTED = 3, 1000
 LOOKS = (0.25, 0.5, 1.0)
 TRIAL_STEPS = 200  # of those that choose the start
 # Steps of both fields before people see their renders, but no more than so many times the trial's: earlier, shapes have
-# no colours yet (lego at 100 px, true poses: 16.2 dB after 50 steps, 19.2 after 200, 20.8 after 400).
-PICTURE_STEPS, PICTURE_SHARE = 300, 1.5
+# no colours yet (lego at 100 px, true poses: 16.2 dB after 50 steps, 19.2 after 200, 19.7 after 300, for 1.8 times the
+# work after the first look; fox 20.5 and 21.1, fountain-P11 23.6 and 23.8).
+PICTURE_STEPS, PICTURE_SHARE = 200, 1.5
 # Times the verdict's steps, to choose between photos and matches: shorter trials cannot tell wrong poses that agree
 # with each other from bent ones (docs/estimator.md).
 PHOTO_TRIALS = 2

@@ -112,9 +112,10 @@ def judge_poses(
     found = compare_without_training(scene, refined, lost)
     heldout: HeldOutComparison | None = None
     if found.findings.moved_px >= MEASURABLE_PX:
+        effort = Effort(rounds_most=rounds_most, pictured=True, favoured=found.findings.favoured_by_matches)
         heldout = compare_placed(
             found.before, found.after, scene, optimiser, found.placed | (not found.findings.grounded),
-            should_stop, report, Effort(rounds_most=rounds_most, pictured=True),
+            should_stop, report, effort,
         )  # fmt: skip
     took(heldout.work if heldout else 0.0)
     verdict = decide(replace(found.findings, heldout=heldout.evidence if heldout else None))

@@ -59,6 +59,13 @@ class Findings:
         lost_px = (error.before - error.after) * self.working_share
         return EXPLAINED * (self.moved_px - UNEXPLAINED_PX) < lost_px
 
+    @property
+    def favoured_by_matches(self) -> Literal[-1, 0, 1]:
+        """The poses that feature matches speak for: 1 the refined ones, -1 the input's, 0 neither."""
+        if self.epipolar is not None and self.epipolar.error_px.finding == "worse":
+            return -1
+        return 1 if _matches_are_better(self) and self.explained else 0
+
 
 def failed_checks(refined: Array, lost: int) -> tuple[str, ...]:
     """Sentences on what is inconsistent about refined poses [n, 4, 4]; `lost` cameras agree with no pose found."""
@@ -150,7 +157,7 @@ def _for(f: Findings) -> list[str]:
     names = []
     if f.heldout is not None and f.heldout.psnr.finding == "better":
         names.append(VIEWS)
-    if _matches_are_better(f) and f.explained:
+    if f.favoured_by_matches > 0:
         names.append(MATCHES)
     return names
 
@@ -164,7 +171,7 @@ def _against(f: Findings) -> list[str]:
     names = []
     if f.heldout is not None and "worse" in (f.heldout.psnr.finding, f.heldout.ssim.finding):
         names.append(VIEWS)
-    if f.epipolar is not None and f.epipolar.error_px.finding == "worse":
+    if f.favoured_by_matches < 0:
         names.append(MATCHES)
     return names
 

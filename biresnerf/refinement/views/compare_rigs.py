@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import torch
@@ -58,12 +59,14 @@ class Effort:
         rounds_most: small sets are trained so often, with other views left out, unless the first ones decide.
         looks: shares of a training after which fields are compared; the last is 1.
         pictured: whether some held-out views are rendered with either rig, to be looked at.
+        favoured: the rig that other evidence favours: 1 the second, -1 the first, 0 none.
     """
 
     times: int = 1
     rounds_most: int = ROUNDS_MOST
     looks: tuple[float, ...] = LOOKS
     pictured: bool = False
+    favoured: Literal[-1, 0, 1] = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +130,7 @@ def compare_on_unseen_views(
             scores = tuple(trial.scores() for trial in running)
             old, new = (joined(side) for side in zip(*earlier, scores, strict=True))
             evidence = _evidence(old, new, running[0].optimiser.step_index, len(set(seen) & set(held_out)))
-            decided = _decided(evidence, EARLY if look < 1 else 1)
+            decided = _decided(evidence, EARLY if look < 1 else 1, effort.favoured)
             if pictured and (decided or look == 1):
                 renders = _pictures(running, [view for view in views if view in held_out][:SHOWN], enough)
             did = work + sum(trial.work for trial in running)
@@ -154,17 +157,21 @@ def _evidence(before: TrialScores, after: TrialScores, steps: int, strictly: int
     return HeldOutEvidence(steps=steps, strictly=strictly, psnr=psnr, ssim=ssim)
 
 
-def _decided(evidence: HeldOutEvidence, times: float) -> bool:
-    """Whether both intervals lie beyond so many times what matters, on the same side.
+def _decided(evidence: HeldOutEvidence, times: float, favoured: int) -> bool:
+    """Whether both intervals lie beyond so many times what matters, on the same side; or beyond 0, on the favoured one.
 
     Other views, or more steps, would hardly change that.
     """
-    psnr, ssim = evidence.psnr, evidence.ssim
-    if psnr.low is None or psnr.high is None or ssim.low is None or ssim.high is None:
-        return False
-    better = psnr.low > times * PSNR_MATTERS and ssim.low > times * SSIM_MATTERS
-    worse = psnr.high < -times * PSNR_MATTERS and ssim.high < -times * SSIM_MATTERS
-    return better or worse
+    both = ((evidence.psnr, PSNR_MATTERS), (evidence.ssim, SSIM_MATTERS))
+    for side in (1, -1):
+        nearest = [found.low if side > 0 else found.high for found, _ in both]
+        beyond = 0 if side == favoured else times
+        if all(
+            end is not None and side * end > beyond * matters
+            for end, (_, matters) in zip(nearest, both, strict=True)
+        ):
+            return True
+    return False
 
 
 def compare_placed(

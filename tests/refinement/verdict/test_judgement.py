@@ -14,11 +14,12 @@ from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.refinement.verdict.image_flags import blurred, exposure_off, moved_far, sharpness
 from biresnerf.refinement.verdict.judgement import Judgement, judge_poses
 from biresnerf.refinement.verdict.pose_evidence import compare_on_matches, working_share
-from biresnerf.refinement.views import pose_trials
+from biresnerf.refinement.views import compare_rigs, pose_trials
 from biresnerf.refinement.views.compare_rigs import Rig
 from biresnerf.refinement.views.held_out_views import held_out_views, unseen_rounds, unseen_views
 from biresnerf.refinement.views.motion import moved_px
 from biresnerf.report import EpipolarEvidence
+from biresnerf.studies.scenes import with_poses
 from tests.refinement.tiny_scene import (
     CPU,
     given_scene,
@@ -42,11 +43,6 @@ def scene(tmp_path_factory):
 @pytest.fixture(scope="module")
 def noisy(scene):
     return perturb_poses(scene[0].world_from_cam, 0.1, seed=1)
-
-
-def with_poses(dataset: Dataset, poses: np.ndarray) -> Dataset:
-    frames = tuple(replace(f, world_from_cam=p) for f, p in zip(dataset.frames, poses, strict=True))
-    return replace(dataset, frames=frames)
 
 
 def judged(
@@ -80,7 +76,7 @@ def test_other_views_are_left_out_only_until_they_decide(scene):
 
 def test_trainings_end_once_they_decide_but_for_pictures(scene):
     dataset, images = scene
-    truth, steps, pictured = dataset.world_from_cam, 240, 300
+    truth, steps, pictured = dataset.world_from_cam, 240, 200
     options = OPTIONS.model_copy(update={"trial_steps": steps})
     optimiser = tiny_optimiser(dataset, images, options, held_out=[3])
     for noise, decided, other_rounds in ((0.3, steps // 4, 0), (0.02, steps, steps)):
@@ -89,10 +85,26 @@ def test_trainings_end_once_they_decide_but_for_pictures(scene):
         shares: list[float] = []
         judgement = judge_poses(run, optimiser, report=shares.append, took=works.append)
         assert judgement.verdict.heldout.steps == decided
-        assert works == [2 * (pictured + other_rounds)]
+        assert works == [2 * (max(pictured, decided) + other_rounds)]
         if not other_rounds:
             assert shares[-1] == pytest.approx(decided / pictured), "pictures take the rest"
         assert judgement.renders.keys() == {3}
+
+
+def test_trainings_end_once_they_agree_with_what_matches_say(scene, monkeypatch):
+    monkeypatch.setattr(compare_rigs, "PSNR_MATTERS", 50.0)  # so large a gain there is not
+    dataset, images = scene
+    truth, noisy = dataset.world_from_cam, perturb_poses(dataset.world_from_cam, 0.3, seed=1)
+    options = OPTIONS.model_copy(update={"trial_steps": 80})
+
+    def steps(given: np.ndarray, refined: np.ndarray, tracks: Tracks | None) -> int:
+        optimiser = tiny_optimiser(with_poses(dataset, refined), images, options, held_out=[3])
+        run = replace(given_scene(with_poses(dataset, given), images, [3]), tracks=tracks)
+        return judge_poses(run, optimiser).verdict.heldout.steps
+
+    matches = true_matches(dataset)
+    assert steps(noisy, truth, matches) == steps(truth, noisy, matches) < 80
+    assert steps(noisy, truth, None) == 80
 
 
 def test_poses_that_a_broken_refinement_spoilt_are_not_returned(scene, noisy):
