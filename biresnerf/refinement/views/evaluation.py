@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from biresnerf.data.photos.images import ImageSet
-from biresnerf.field.radiance_field import PositionGradient
+from biresnerf.field.radiance_field import PositionGradient, Rendering
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.optimise.photo_sampler import PixelBatch
 from biresnerf.refinement.views.image_metrics import psnr, ssim
 
 FIT_STEPS, FIT_RATE, FIT_RAYS = 100, 1e-3, 1024  # BARF's test-time pose refinement
@@ -50,27 +51,34 @@ def fit_held_out_poses(optimiser: JointOptimiser, held_out: list[int]) -> None:
 
     And their exposures, where those are compensated. Poses that are held stay: the field's own error would move them.
     """
-    if not held_out or (optimiser.poses_held and optimiser.exposure.gains() is None):
+    held, exposure, poses = optimiser.poses_held, optimiser.exposure, optimiser.poses
+    if not held_out or (held and exposure.gains() is None):
         return
-    mobility = torch.zeros(len(optimiser.poses), device=optimiser.device)
-    mobility[held_out] = 0.0 if optimiser.poses_held else 1.0
+    mobility = torch.zeros(len(poses), device=optimiser.device)
+    mobility[held_out] = 1.0
     mobility[torch.from_numpy(optimiser.bodies.fixed).to(optimiser.device)] = 0.0
-    schedule = optimiser.schedule
-    gradient = PositionGradient()
-    poses = optimiser.poses
     poses.restart_adam()
-    exposure = optimiser.exposure
     exposure.restart_adam()
-    rays = fit_rays(optimiser)
+    if held:  # what is seen of the field stays the same
+        with torch.no_grad():
+            batch, rendering = _seen_by_held_out(optimiser, CHUNK)
     for step in range(FIT_STEPS):
-        batch = optimiser.sampler.draw(rays, 0.0, optimiser.generator, held_out_only=True)
-        matrices = poses.matrices()[batch.image]
-        origin, direction = optimiser.cast(matrices, batch.image, batch.xy)
-        rendering = optimiser.render(origin, direction, 0, schedule.fine_interval, gradient, jitter=True)
+        if not held:
+            batch, rendering = _seen_by_held_out(optimiser, fit_rays(optimiser))
         colour = exposure.forgiven(exposure.shown(rendering, batch.image), batch.sharp)
         (optimiser.method.loss(colour, batch.sharp) * batch.weight[:, None]).mean().backward()
-        poses.step(FIT_RATE * 0.1 ** (step / FIT_STEPS), mobility)
+        if not held:
+            poses.step(FIT_RATE * 0.1 ** (step / FIT_STEPS), mobility)
         exposure.step(FIT_EXPOSURE_RATE * 0.1 ** (step / FIT_STEPS))
+
+
+def _seen_by_held_out(optimiser: JointOptimiser, rays: int) -> tuple[PixelBatch, Rendering]:
+    """Pixels drawn from the held-out photos, and what the field shows there from the present poses."""
+    batch = optimiser.sampler.draw(rays, 0.0, optimiser.generator, held_out_only=True)
+    matrices = optimiser.poses.matrices()[batch.image]
+    origin, direction = optimiser.cast(matrices, batch.image, batch.xy)
+    interval = optimiser.schedule.fine_interval
+    return batch, optimiser.render(origin, direction, 0, interval, PositionGradient(), jitter=True)
 
 
 @torch.no_grad()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -146,6 +148,30 @@ def test_fitting_held_out_poses_moves_them_alone_and_no_field(trained, monkeypat
     assert [i for i in range(len(poses)) if not torch.equal(poses[i], after[i])] == [3]
     for name, tensor in before.items():
         assert torch.equal(optimiser.state()[name], tensor), name
+
+
+def test_exposures_of_held_out_views_whose_poses_are_held_are_fitted_to_one_rendering(tmp_path, monkeypatch):
+    dataset, images = tiny_set(tmp_path)
+    options = tiny_options(exposure="on")
+    first = tiny_optimiser(dataset, images, options, held_out=[3])
+    for _ in range(20):
+        first.step()
+    true = torch.tensor([0.9, 1.1, 0.85])
+    with torch.no_grad():
+        first.exposure.log_gain[3] = true.log()
+    shown = render_view(first, first.poses.matrices().detach()[3], 3, as_photo=True).colour
+    pixels = images.pixels.copy()
+    pixels[int(images.offsets[3]) : int(images.offsets[4])] = np.rint(255 * shown).reshape(-1, 3)
+    optimiser = tiny_optimiser(dataset, replace(images, pixels=pixels), options, held_out=[3])
+    optimiser.load_state(first.state(), first.step_state())
+    optimiser.exposure.forget(3)
+    optimiser.poses_held, poses = True, optimiser.poses.matrices().detach().clone()
+    calls, render = [], optimiser.render
+    monkeypatch.setattr(optimiser, "render", lambda *rays, **how: calls.append(how) or render(*rays, **how))
+    fit_held_out_poses(optimiser, [3])
+    assert torch.equal(optimiser.poses.matrices().detach(), poses)
+    assert len(calls) == 1
+    np.testing.assert_allclose(optimiser.exposure.gains()[3], true, rtol=0.02)
 
 
 def test_scores_compare_the_render_of_each_view_with_its_own_photo(trained):
