@@ -39,15 +39,16 @@ PHOTO_TRIALS = 2
 # difference after 200 steps, 4 dB after 400).
 OPEN_STEPS = 2  # times the steps of a scene with a background
 OPEN_STEP = 1.6  # times the work of a step of one, as measured (docs/speed.md)
-# As measured (docs/speed.md): the rendering of an open scene against one with a background.
-OPEN_EVALUATION = 3.0
+# As measured (docs/speed.md): the rendering of an open scene (entry-P10, lund_door) against one with a background.
+OPEN_EVALUATION = 2.0
 # Thousands of observations of tracks that take as long as what an adjustment does without any: surfaces, patches, and
 # their choice, which are bounded. lego at 100 px, fountain-P11, temple and fox (4, 35, 58 and 87 thousand) take 7.0,
 # 6.9, 10.6 to 16.6, and 11.0 to 12.1 s.
 ADJUSTMENT = 140.0
 OBSERVED = 0.5  # of a photo's features, of tracks: 0.4 to 0.8 in these sets
-# Trial steps that take as long as the rest of a verdict: temple's takes 2.8 s without its training, fox's 3.5.
-JUDGING = 250.0
+# Trial steps that take as long as the rest of a verdict: fox's took 3.5 s without its training, 2.2 of them renders
+# that take a third of it at coarser intervals.
+JUDGING = 150.0
 # Features of a megapixel, and the time for a small photo's.
 FEATURES_OF_MEGAPIXEL, THOROUGH = 10_000, 4.0
 # Thousands of features that an image takes as long to be mapped as: lego at 100 px (100 images of 100), temple (47 of

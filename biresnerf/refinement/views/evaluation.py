@@ -90,26 +90,26 @@ def render_view(
     stride: int = 1,
     *,
     as_photo: bool = False,
+    coarser: float = 1.0,
 ) -> RenderedView:
     """Render what a camera at `unit_from_cam` [3, 4] with the intrinsics of `image` sees, whole.
 
     `intrinsics` are the run's images' where not given; of rows and columns every `stride`-th is rendered. `as_photo`
-    gives it the exposure of photo `image`, to be compared with it; else it has the mean exposure of all.
+    gives it the exposure of photo `image`, to be compared with it; else it has the mean exposure of all. Rays are
+    marched at `coarser` times the fine interval.
     """
     lenses = intrinsics or optimiser.intrinsics
     width, height = int(lenses.width[image]), int(lenses.height[image])
     rows, columns = torch.arange(0, height, stride) + 0.5, torch.arange(0, width, stride) + 0.5
     y, x = torch.meshgrid(rows, columns, indexing="ij")
     pixels = torch.stack([x, y], -1).reshape(-1, 2).to(optimiser.device)
-    parts = []
+    parts, interval = [], coarser * optimiser.schedule.fine_interval
     for xy in pixels.split(CHUNK):
         index = torch.full((len(xy),), image, device=optimiser.device)
         origin, direction = optimiser.cast(
             unit_from_cam.float().to(optimiser.device).expand(len(xy), 3, 4), index, xy, lenses
         )
-        part = optimiser.render(
-            origin, direction, 0, optimiser.schedule.fine_interval, PositionGradient(), jitter=False
-        )
+        part = optimiser.render(origin, direction, 0, interval, PositionGradient(), jitter=False)
         colour = optimiser.exposure.shown(part, index) if as_photo else part.colour
         parts.append(torch.cat([colour, part.depth[:, None], part.opacity[:, None]], 1).cpu())
     whole = torch.cat(parts).reshape(len(rows), len(columns), 5).numpy()

@@ -134,6 +134,21 @@ def test_a_whole_view_has_every_pixel_once_in_its_place(trained):
     np.testing.assert_allclose(view.colour[6, 17], alone.colour[0].numpy(), atol=1e-6)
 
 
+def test_a_young_field_looks_the_same_at_coarser_intervals(trained, monkeypatch):
+    optimiser, _ = trained
+    matrix, samples, render = optimiser.poses.matrices().detach()[2], [], optimiser.render
+
+    def counted(*rays, **how):
+        rendering = render(*rays, **how)
+        samples.append(rendering.samples)
+        return rendering
+
+    monkeypatch.setattr(optimiser, "render", counted)
+    fine, coarse = (render_view(optimiser, matrix, 2, coarser=times).colour for times in (1.0, 2.0))
+    assert samples[1] < 0.6 * samples[0]
+    assert -10 * np.log10(((fine - coarse) ** 2).mean()) > 40
+
+
 def test_fitting_held_out_poses_moves_them_alone_and_no_field(trained, monkeypatch):
     monkeypatch.setattr(evaluation, "FIT_STEPS", 8)
     optimiser, _ = trained
