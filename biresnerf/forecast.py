@@ -69,7 +69,7 @@ class Forecast:
         self.left: dict[Phase, float] = {}
         self.step_weights: dict[Phase, float] = {"coarse": 1.0, "fine": 1.0}
         self.share = 1.0
-        self._slower = 1.0  # than expected, by the last steps
+        self._slower = 1.0  # than expected, by the last steps, or before them by what was measured
         self._earlier_s, self._began = 0.0, time.monotonic()
         self._phase: Phase | None = None
         self._phase_began = self._done = 0.0
@@ -121,7 +121,15 @@ class Forecast:
             unit, seconds = UNITS[self._phase], time.monotonic() - self._phase_began
             self.rates[unit] = seconds / amount
             self._measured[unit] = seconds
+            if not self._steps:
+                self._slower = self._slower_so_far()
         self._phase = None
+
+    def _slower_so_far(self) -> float:
+        """Of all that was measured long enough to tell: what it took over what was expected."""
+        told = {unit: s for unit, s in self._measured.items() if s >= TELLING_S}
+        expected = sum(s * self._expected[unit] / self.rates[unit] for unit, s in told.items())
+        return sum(told.values()) / expected if told else 1.0
 
     def advance(self, share: float) -> None:
         """So much of the phase is done."""
@@ -130,7 +138,8 @@ class Forecast:
     def stepped(self, stage: Literal["coarse", "fine"], seconds: float) -> None:
         """Add the time of one step. The first of a stage does not count: kernels may be compiled in it.
 
-        What was not measured yet is expected to be as much slower than thought as the steps are.
+        What was not measured yet is expected to be as much slower than thought as the steps are; before them, as all
+        that was measured.
         """
         unit = UNITS[stage]
         before = self._steps.get(unit, 0)

@@ -7,6 +7,7 @@ import pytest
 from biresnerf.forecast import (
     RATES,
     RATES_FILE,
+    TELLING_S,
     Forecast,
     cache_folder,
     remember_rates,
@@ -54,6 +55,21 @@ def test_a_machine_whose_steps_are_slower_is_thought_slower_in_all_that_was_not_
     with found.within("trying", 10.0):
         time.sleep(0.1)
     assert found.left_s() == pytest.approx(400 * 0.01, rel=0.2)
+
+
+def test_before_the_steps_a_machine_is_thought_as_slow_as_what_it_has_done(monkeypatch):
+    clock = [100.0]
+    monkeypatch.setattr("biresnerf.forecast.time.monotonic", lambda: clock[0])
+    found = forecast(features=10.0, matching=1.0, judging=400.0)
+    for phase, took_s in (("features", 30 * RATES["megapixel"]), ("matching", TELLING_S / 2)):
+        with found.within(phase):
+            clock[0] += took_s
+    assert found.left_s() == pytest.approx(3 * 400 * RATES["trial step"]), (
+        "but for what took no time to speak of"
+    )
+    for _ in range(2):
+        found.stepped("coarse", 2 * COARSE_S)
+    assert found.left_s() == pytest.approx(2 * 400 * RATES["trial step"]), "steps tell more"
 
 
 def test_a_phase_that_is_over_has_nothing_left_and_teaches_what_the_rest_of_it_will_take():
