@@ -114,13 +114,14 @@ class CpuField(GridField):
         return Rendering(colour, opacity, depth, int(count))
 
     def density(self, position: Tensor) -> Tensor:
-        result = np.empty(len(position), f4)
-        self._density(position.contiguous().numpy().reshape(-1), self.modules, result)
-        return torch.from_numpy(result)
+        return self._density_at(position, self.modules)
 
     def estimate(self, position: Tensor, count: Tensor | None = None) -> Tensor:
+        return self._density_at(position, MODULES[:1])
+
+    def _density_at(self, position: Tensor, modules: tuple[str, ...]) -> Tensor:
         result = np.empty(len(position), f4)
-        self._density(position.contiguous().numpy().reshape(-1), MODULES[:1], result)
+        self._density(position.contiguous().numpy().reshape(-1), modules, result)
         return torch.from_numpy(result)
 
     def _density(self, x: np.ndarray, modules: tuple[str, ...], density: np.ndarray) -> None:

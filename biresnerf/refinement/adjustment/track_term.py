@@ -128,10 +128,11 @@ class TrackTerm:
         return self.unknowns - np.einsum("pab,pb->pa", inverses, force)
 
     def _seen(
-        self, cameras: Cameras, points: Array, taken: slice = slice(None)
+        self, cameras: Cameras, points: Array, taken: slice | None = None
     ) -> tuple[NDArray[np.generic], ...]:
         """What all kernels read, of all points [p, 3] or of a part of them."""
-        start = self.start if taken == slice(None) else self.start[taken.start : taken.stop + 1]
+        taken = taken or slice(0, len(points))
+        start = self.start[taken.start : taken.stop + 1]
         lens = cameras.lens_rows(self.lens)
         if self._views is None:
             return cameras.rotation, cameras.centre, lens, points[taken], start, self.image, self.xy

@@ -112,9 +112,8 @@ class PhotoSampler:
 
     def random_blur(self, blur_px: float, generator: torch.Generator) -> tuple[int, float]:
         """A random share of `blur_px`, as a level of the pyramid and the share of the next one."""
-        sigma = max(
-            blur_px * self._share(generator), LEVEL_SIGMA
-        )  # level 0 is sharp at the centres of pixels
+        # Level 0 is sharp at the centres of pixels.
+        sigma = max(blur_px * self._share(generator), LEVEL_SIGMA)
         level = min(math.log2(sigma / LEVEL_SIGMA), PYRAMID_LEVELS - 1.0)
         lower = min(int(level), PYRAMID_LEVELS - 2)
         return lower, level - lower
