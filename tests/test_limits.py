@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-FILE_LINES, FUNCTION_LINES, ENTRIES, SMALL_LINES = 300, 60, 14, 50
+FILE_LINES, FUNCTION_LINES, ENTRIES, SMALL_LINES = 400, 60, 14, 50
 DRAWERS = {"utils", "helpers", "common", "core", "misc"}
 SOURCES = [
     path
