@@ -12,7 +12,8 @@ from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.geometry.similarity import Similarity, align_by_spread
 
 Array = NDArray[np.float64]
-THRESHOLDS_DEG = (1, 3, 5, 10)
+THRESHOLDS_DEG = (0.5, 1, 3, 5, 10)
+WRONG_DEG = 180.0  # what a pair counts as of which a camera was not placed, as in COLMAP's benchmark
 # Two centres closer than this share of the rig's size have no direction from one to the other.
 _NO_BASELINE = 1e-6
 
@@ -29,15 +30,27 @@ class TrajectoryError(FrozenModel):
         "mean square of its translation; none of one camera."
     )
     rpe_rotation_deg_rmse: float | None = Field(description="The same of its angle.")
-    auc: dict[int, float] = Field(
+    auc: dict[str, float] = Field(
         description="By threshold t in degrees: area, from 0 to t and over t, under the share of camera pairs whose "
         "relative rotation and direction of translation are both within an angle. Needs no alignment; empty for one "
         "camera."
     )
+    auc_all: dict[str, float] = Field(
+        description="The same over all cameras of the truth: pairs with one that was not placed are wrong."
+    )
+    auc_covisible: dict[str, float] = Field(
+        description="The same as auc over pairs that see enough common points of the truth; empty if it has none."
+    )
 
 
-def trajectory_error(estimate: Array, truth: Array) -> TrajectoryError:
+def trajectory_error(
+    estimate: Array, truth: Array, missing: int = 0, covisible: NDArray[np.bool_] | None = None
+) -> TrajectoryError:
     """Errors of poses ``world_from_cam`` [n, 4, 4] against true ones of the same cameras in the same order.
+
+    Args:
+        missing: how many more cameras the truth has.
+        covisible: symmetric [n, n], which cameras see the same.
 
     Raises:
         ValueError: if shapes differ, there is no camera, or a number is not finite.
@@ -46,12 +59,16 @@ def trajectory_error(estimate: Array, truth: Array) -> TrajectoryError:
     aligned = _least_squares(estimate, truth).apply_to_poses(estimate)
     centres = np.linalg.norm(aligned[:, :3, 3] - truth[:, :3, 3], axis=1)
     steps = rigid_inverse(_steps(truth)) @ _steps(aligned)
-    errors = relative_errors_deg(estimate, truth)
+    errors, n = relative_errors_deg(estimate, truth), len(truth)
+    wrong = np.full(missing * (2 * n + missing - 1) // 2, WRONG_DEG)
+    seen = np.zeros((n, n), bool) if covisible is None else covisible
     return TrajectoryError(
         ate_rmse=float(np.sqrt(np.mean(centres**2))),
         rpe_translation_rmse=_rms(np.linalg.norm(steps[:, :3, 3], axis=1)),
         rpe_rotation_deg_rmse=_rms(rotation_angle_deg(steps[:, :3, :3])),
-        auc={limit: area_under_recall(errors, limit) for limit in THRESHOLDS_DEG if len(errors)},
+        auc=_areas(errors),
+        auc_all=_areas(np.concatenate((errors, wrong))),
+        auc_covisible=_areas(errors[seen[np.triu_indices(n, 1)]]),
     )
 
 
@@ -97,6 +114,10 @@ def _angle_deg(a: Array, b: Array) -> Array:
     across = np.linalg.norm(np.cross(a, b), axis=1)
     along = np.einsum("ni,ni->n", a, b)
     return np.where((across == 0) & (along == 0), 90.0, np.degrees(np.arctan2(across, along)))
+
+
+def _areas(errors: Array) -> dict[str, float]:
+    return {f"{limit:g}": area_under_recall(errors, limit) for limit in THRESHOLDS_DEG if len(errors)}
 
 
 def area_under_recall(errors: Array, limit: float) -> float:

@@ -84,4 +84,21 @@ def test_cameras_at_one_place_are_judged_by_their_rotations_and_one_camera_has_n
     truth[2, 0, 3] = 1.0
     assert relative_errors_deg(truth, truth) == pytest.approx(np.zeros(3))
     one = trajectory_error(truth[:1], truth[:1])
+    assert (one.auc_all, one.auc_covisible) == ({}, {})
     assert (one.auc, one.rpe_translation_rmse, one.rpe_rotation_deg_rmse) == ({}, None, None)
+
+
+def test_cameras_that_were_not_placed_make_all_their_pairs_wrong_and_covisible_pairs_are_judged_alone() -> (
+    None
+):
+    rng = np.random.default_rng(5)
+    truth = dome(6, rng)
+    estimate = truth.copy()
+    estimate[5, :3, :3] = truth[5, :3, :3] @ Rotation.from_euler("z", 30, degrees=True).as_matrix()
+    covisible = np.ones((6, 6), bool)
+    covisible[5], covisible[:, 5] = False, False
+    error = trajectory_error(estimate, truth, missing=4, covisible=covisible)
+    for limit in ("0.5", "1", "3", "5"):
+        assert error.auc[limit] == pytest.approx(10 / 15, abs=1e-5)
+        assert error.auc_all[limit] == pytest.approx(10 / 45, abs=1e-5)
+        assert error.auc_covisible[limit] == pytest.approx(1.0, abs=1e-5)

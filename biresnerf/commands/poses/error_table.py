@@ -87,10 +87,19 @@ def _further(after: TrajectoryError, before: TrajectoryError | None) -> list[str
     if len(steps) == len(sets):
         pairs = (f"{one.rpe_translation_rmse:.5g}, {one.rpe_rotation_deg_rmse:.5g} deg" for one in steps)
         lines.append(f"RPE {_way(pairs)} (RMSE, from each image to the next)")
-    if all(one.auc for one in sets):
-        areas = (f"@{limit} {_way(f'{100 * one.auc[limit]:.1f}' for one in sets)} %" for limit in after.auc)
-        lines.append(f"AUC of relative poses {'  '.join(areas)} (degrees)")
+    lines += _areas("AUC of relative poses", [one.auc for one in sets])
+    lines += _areas("  of pairs that share a view", [one.auc_covisible for one in sets])
+    if any(one.auc_all != one.auc for one in sets):
+        lines += _areas("  with cameras that were not placed", [one.auc_all for one in sets])
     return lines
+
+
+def _areas(title: str, sets: list[dict[str, float]]) -> list[str]:
+    """A line on areas under recall by threshold in degrees; none where a set has no pairs."""
+    if not all(sets):
+        return []
+    areas = (f"@{limit}° {_way(f'{100 * one[limit]:.1f}' for one in sets)}" for limit in sets[-1])
+    return [f"{title:<36}{'  '.join(areas)} (%)"]
 
 
 def _way(texts: Iterable[str]) -> str:

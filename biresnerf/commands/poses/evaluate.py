@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from biresnerf.commands.poses.error_table import Measured
     from biresnerf.geometry.pose_error import Array
 
+SHARED_POINTS = 5  # that two photos have in common if they share a view, as in COLMAP's benchmark
+
 
 @click.command("evaluate")
 @click.argument("result", type=click.Path(path_type=Path))
@@ -45,11 +47,11 @@ def evaluate_command(
     """
     from biresnerf.commands.poses.error_table import error_table
     from biresnerf.commands.poses.plot_errors import refuse_other_files
-    from biresnerf.data.formats.read_dataset import read_poses
+    from biresnerf.data.formats.read_dataset import read_poses, seen_points
 
     if plot is not None:
         refuse_other_files(plot)
-    estimated, true = read_poses(result), read_poses(truth)
+    estimated, true, points = read_poses(result), read_poses(truth), seen_points(truth)
     pairs = matched_names(list(estimated), list(true))
     if not pairs:
         raise InputError(
@@ -60,11 +62,11 @@ def evaluate_command(
         )
     before = _given_poses(result) if before_path is None else read_poses(before_path)
     had = dict(matched_names([name for name, _ in pairs], list(before)))
-    after = _measure(estimated, true, pairs, paper_compat)
+    after = _measure(estimated, true, points, pairs, paper_compat)
     earlier = None
     if had:
         of_before = [(had[name], other) for name, other in pairs if name in had]
-        earlier = _measure(before, true, of_before, paper_compat)
+        earlier = _measure(before, true, points, of_before, paper_compat)
     if plot is not None:
         _plot(plot, {name: before[had[name]] for name in had}, estimated, true, pairs, after)
     left_out = {"result": len(estimated) - len(pairs), "truth": len(true) - len(pairs)}
@@ -100,7 +102,11 @@ def _given_poses(result: Path) -> dict[str, Array]:
 
 
 def _measure(
-    poses: dict[str, Array], true: dict[str, Array], pairs: list[tuple[str, str]], paper_compat: bool
+    poses: dict[str, Array],
+    true: dict[str, Array],
+    points: dict[str, set[int]],
+    pairs: list[tuple[str, str]],
+    paper_compat: bool,
 ) -> Measured:
     import numpy as np
 
@@ -117,7 +123,10 @@ def _measure(
     }
     if paper_compat:
         frames["paper_compat"] = paper_compat_error(*both)
-    return Measured([name for name, _ in pairs], error, frames, trajectory_error(*both))
+    seen = [points.get(name, set()) for _, name in pairs]
+    covisible = np.array([[len(a & b) >= SHARED_POINTS for b in seen] for a in seen])
+    further = trajectory_error(*both, len(true) - len(pairs), covisible)
+    return Measured([name for name, _ in pairs], error, frames, further)
 
 
 def _plot(

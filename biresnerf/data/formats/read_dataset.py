@@ -15,6 +15,7 @@ from biresnerf.data.formats.folder import FolderContents, look_at, look_into
 from biresnerf.data.formats.parsed_poses import ParsedPoses, PoseEntry, without_problems
 from biresnerf.data.formats.positions.position_priors import position_notes
 from biresnerf.data.formats.registry import ALL_CODECS
+from biresnerf.data.model.colmap_scene import NO_POINT
 from biresnerf.data.model.dataset import Dataset, SourceFormat
 from biresnerf.data.photos.masks import refuse_unfit_mask
 from biresnerf.data.photos.named_images import refuse_outside
@@ -119,6 +120,16 @@ def read_poses(path: Path) -> dict[str, NDArray[np.float64]]:
     except InputError as error:
         raise _at(place, error, place.name) from None
     return poses
+
+
+def seen_points(path: Path) -> dict[str, set[int]]:
+    """The ids of the points that each image sees, by its name as in `read_poses`; none of any but COLMAP's models."""
+    contents = find_input(path)
+    if contents.format is None or contents.poses is None:
+        return {}
+    model = _parse(contents.format, contents.root, contents.poses).source.colmap
+    images = () if model is None else model.images.values()
+    return {posixpath.normpath(one.name): {*one.point3d_ids.tolist()} - {NO_POINT} for one in images}
 
 
 def find_input(path: Path) -> FolderContents:

@@ -15,7 +15,10 @@ from imageio.v3 import imread
 from scipy.spatial.transform import Rotation
 
 from biresnerf.commands.poses.evaluate import evaluate_command, matched_names
+from biresnerf.data.formats.colmap.write_binary import write_colmap_binary
 from biresnerf.data.formats.simple.poses_json import write_poses_json
+from biresnerf.data.model.colmap_scene import ColmapPoints
+from biresnerf.data.model.result_model import with_points
 from biresnerf.errors import InputError
 from biresnerf.geometry.pose_error import pose_error
 from tests.data.formats.random_sets import random_result
@@ -70,7 +73,27 @@ def test_ate_rpe_and_auc_are_told_in_json_and_in_words(tmp_path):
     assert error["rpe_rotation_deg_rmse"] == pytest.approx(24 * np.sqrt(2 / 11))
     # Of 66 pairs the 11 of the turned camera are wrong; the others are right.
     assert error["auc"]["10"] == pytest.approx(55 / 66, abs=1e-6)
-    assert re.search(r"AUC of relative poses @1 83\.3 %", run(*files))
+    assert re.search(r"AUC of relative poses +@0\.5° 83\.3  @1° 83\.3", run(*files))
+
+
+def test_pairs_that_share_no_view_of_a_true_model_are_told_apart_and_missing_cameras_count(tmp_path):
+    truth = random_result(2, count=6)
+    photos, tracks = truth.image_ids[:2], 5  # photos 0 and 1 see five common points, the others none
+    points = ColmapPoints(
+        np.arange(1, tracks + 1), np.zeros((tracks, 3)), np.zeros((tracks, 3), np.uint8), np.zeros(tracks),
+        2 * np.arange(tracks + 1), np.tile(photos, tracks), np.repeat(np.arange(tracks), 2),
+    )  # fmt: skip
+    write_colmap_binary(with_points(truth.model, points), tmp_path / "sparse/0")
+    poses = np.stack([image.world_from_cam for image in truth.images])
+    poses[2, :3, :3] = poses[2, :3, :3] @ Rotation.from_euler("x", 40, degrees=True).as_matrix()
+    result = write(tmp_path / "a.json", poses[:5], name="images/ö {:02}.jpg")
+    error = json.loads(run(result, tmp_path / "sparse/0", "--json"))
+    assert error["auc"]["1"] == pytest.approx(6 / 10, abs=1e-5)
+    assert error["auc_all"]["1"] == pytest.approx(6 / 15, abs=1e-5)
+    assert error["auc_covisible"]["1"] == pytest.approx(1.0, abs=1e-5)
+    said = run(result, tmp_path / "sparse/0")
+    assert re.search(r"of pairs that share a view +@0\.5° 100\.0", said)
+    assert re.search(r"with cameras that were not placed +@0\.5° 40\.0", said)
 
 
 def test_errors_before_and_after_stand_side_by_side_and_are_drawn(tmp_path):
