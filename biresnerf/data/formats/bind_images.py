@@ -12,6 +12,7 @@ from biresnerf.data.formats.match_names import EXPECTED, match_files
 from biresnerf.data.formats.parsed_poses import Assignment, ParsedPoses, PoseEntry
 from biresnerf.data.formats.posed_photos import PosedPhotos, read_photos
 from biresnerf.data.model.dataset import Dataset, Frame, IntrinsicsSource, SourceFormat
+from biresnerf.data.model.image_order import names_of_poses, natural_key
 from biresnerf.data.model.pose_validation import refuse_coinciding
 from biresnerf.data.photos.guessed_lens import guess_note
 from biresnerf.data.photos.masks import mask_beside
@@ -36,7 +37,7 @@ def bind_images(parsed: ParsedPoses, root: Path, within: Path | None = None) -> 
     if named and not files:
         files = all_photos(root)
     refuse_no_images(files, root)
-    names = sorted(files)
+    names = sorted(files, key=natural_key)
     assign = parsed.assign or partial(by_name, parsed.entries, strict=parsed.strict)
     pairs, notes = assign(names)
     if parsed.take_file_names:
@@ -65,13 +66,20 @@ def by_name(entries: Sequence[PoseEntry], names: Sequence[str], *, strict: bool 
     return [(found[entry.name], entry) for entry in entries if entry.name in found], notes
 
 
-def in_order(entries: Sequence[PoseEntry], names: Sequence[str], file: str, hint: str) -> Assignment:
-    """The entries with the images in the order of their names. Raises InputError ``pose_count_mismatch``."""
+def in_order(
+    entries: Sequence[PoseEntry], names: Sequence[str], file: str, hint: str, *, as_text: bool = False
+) -> Assignment:
+    """The entries with the images in the order of their names, as `names_of_poses` finds it.
+
+    Raises:
+        InputError: ``pose_count_mismatch``.
+    """
     if len(names) != len(entries):
         detail = f"has {len(entries)} poses for {len(names)} images, and does not say which belongs to which."
         raise InputError("pose_count_mismatch", detail, where=file, hint=hint)
-    pairs = [(name, replace(entry, name=name)) for name, entry in zip(names, entries, strict=True)]
-    return pairs, [f"{file}: images were taken in the order of their names"]
+    ordered, note = names_of_poses(names, [entry.world_from_cam for entry in entries], as_text=as_text)
+    pairs = [(name, replace(entry, name=name)) for name, entry in zip(ordered, entries, strict=True)]
+    return pairs, [f"{file}: images were taken in the order of their names" + (note and f"; {note}")]
 
 
 def dataset_of(

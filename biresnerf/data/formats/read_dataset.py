@@ -17,6 +17,7 @@ from biresnerf.data.formats.positions.position_priors import position_notes
 from biresnerf.data.formats.registry import ALL_CODECS
 from biresnerf.data.model.colmap_scene import NO_POINT
 from biresnerf.data.model.dataset import Dataset, SourceFormat
+from biresnerf.data.model.image_order import natural_key
 from biresnerf.data.photos.masks import refuse_unfit_mask
 from biresnerf.data.photos.named_images import refuse_outside
 from biresnerf.data.photos.photo_folders import few_names, left_out_notes, photos_beside
@@ -163,7 +164,7 @@ def _read_images(root: Path, images: Sequence[Path], within: Path | None, *, str
 
 def _named_entries(parsed: ParsedPoses, root: Path) -> Sequence[PoseEntry]:
     """The entries by names of their own, else by those of the images beside them, where these fit."""
-    beside = [] if parsed.named else sorted(photos_beside(root, parsed.photo_folders))
+    beside = [] if parsed.named else sorted(photos_beside(root, parsed.photo_folders), key=natural_key)
     if beside and parsed.assign is not None:
         try:
             return [entry for _, entry in parsed.assign(beside)[0]]

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 
+from biresnerf.data.model.image_order import natural_key
 from biresnerf.data.photos.image_files import is_image_name
 from biresnerf.data.photos.kinds.photo_kinds import INSTALL, KIND_OF, PHOTO_KINDS, is_readable
 from biresnerf.data.photos.video.ffmpeg_frames import DEMUXERS
@@ -97,19 +98,22 @@ def visible(folder: Path) -> list[Path]:
 
 
 def images_in(folder: Path) -> list[Path]:
-    """The photos in ``folder`` itself, sorted, each once; masks and depth maps that are called so are none."""
+    """The photos in ``folder`` itself, each once, numbers in their names compared as numbers.
+
+    Masks and depth maps that are called so are none.
+    """
     return _once([path for path in visible(folder) if is_photo_name(path.name) and path.is_file()])
 
 
 def images_below(folder: Path) -> list[Path]:
     """The photos in ``folder`` and its folders, sorted, as for `images_in`."""
-    return _once(sorted(path for path in _files_below(folder) if is_photo_name(path.name)))
+    return _once([path for path in _files_below(folder) if is_photo_name(path.name)])
 
 
 def _once(paths: Sequence[Path]) -> list[Path]:
     """The photos but those that are there in a kind that more programs read."""
     doubles = doubled(paths)
-    return [path for path in paths if path not in doubles]
+    return sorted(set(paths) - doubles.keys(), key=lambda path: natural_key(path.as_posix()))
 
 
 def doubled(paths: Iterable[Path]) -> dict[Path, Path]:

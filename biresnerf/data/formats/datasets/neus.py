@@ -89,7 +89,7 @@ def parse_neus(_root: Path, file: Path) -> ParsedPoses:
             ]
             return found, [f"{file.name}: images were taken by their numbers"]
         hint = "Leave in image/ just the images that the cameras are for; their order by name decides."
-        return in_order(parsed.entries, names, file.name, hint)
+        return in_order(parsed.entries, names, file.name, hint, as_text=True)
 
     return replace(parsed, assign=assign, named=False)
 

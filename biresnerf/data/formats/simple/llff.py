@@ -68,7 +68,7 @@ def parse_llff(_root: Path, file: Path) -> ParsedPoses:
     return ParsedPoses(
         SourceFormat("llff", files=(file,)),
         tuple(entries),
-        assign=lambda names: in_order(entries, names, file.name, hint),
+        assign=lambda names: in_order(entries, names, file.name, hint, as_text=True),
         named=False,
     )
 

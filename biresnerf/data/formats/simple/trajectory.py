@@ -24,6 +24,7 @@ from biresnerf.data.formats.simple.trajectory_lines import IMAGES_OF, Trajectory
 from biresnerf.data.model.atomic_file import write_text
 from biresnerf.data.model.conventions import quat_wxyz_from_rotation
 from biresnerf.data.model.dataset import SourceFormat
+from biresnerf.data.model.image_order import names_of_poses
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.photos.photo_folders import few_names
 from biresnerf.errors import InputError
@@ -149,7 +150,9 @@ def matched(trajectory: Trajectory, names: Sequence[str], root: Path) -> tuple[d
             by_number = {names[int(time)]: i for i, time in enumerate(times)}
             return by_number, "by number, in the order of the images' names"
     if count == len(names):
-        return {name: i for i, name in enumerate(names)}, "in the order of the images' names"
+        ordered, note = names_of_poses(names, trajectory.poses)
+        how = "in the order of the images' names" + (note and f"; {note}")
+        return {name: i for i, name in enumerate(ordered)}, how
     raise InputError(
         "pose_count_mismatch",
         f"has {count} poses for {len(names)} images, and does not say which belongs to which.",

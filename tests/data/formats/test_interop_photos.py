@@ -1,0 +1,38 @@
+"""Small cases of other programs' sets whose photos, names, masks, places, times or units went wrong once."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from biresnerf.data.formats.read_dataset import read_dataset
+from tests.data.test_real_sets import ROOT
+
+CASES = ROOT / "interop"
+if not CASES.is_dir():
+    pytest.skip(
+        "no image set interop: set BIRESNERF_TEST_DATA to the folder that holds it", allow_module_level=True
+    )
+
+# The case: frames, frames with a pose, and what a warning says of it.
+READ = {
+    "30_unpadded_numbers/kitti": (12, 12, "as numbers (frame_2.jpg before frame_10.jpg)"),
+    "30_unpadded_numbers/log": (12, 12, "as numbers (2.jpg before 10.jpg)"),
+}
+
+
+@pytest.mark.parametrize("name", READ)
+def test_a_case_is_read_with_its_true_poses_and_says_what_was_done(name):
+    frames, posed, said = READ[name]
+    dataset = read_dataset(CASES / name)
+    assert (len(dataset), int(dataset.posed.sum())) == (frames, posed)
+    if said is not None:
+        assert any(said in text for text in dataset.warnings), dataset.warnings
+    case, _, one = name.rpartition("/")
+    expected = json.loads((CASES / case / f"expected_{one}.json").read_text())
+    for frame in dataset.frames:
+        assert frame.path.name in expected
+        if frame.world_from_cam is not None:
+            np.testing.assert_allclose(frame.world_from_cam, expected[frame.path.name], atol=1e-6)
