@@ -19,7 +19,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Each process of the tests would compile all modules, and pytest rewrite all assertions, again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup web test test-fast test-lowest coverage lint format demo serve bench docs docs-site notebooks screenshots fuzz promises audit sbom compose-check slurm-check consumers-check
+.PHONY: help setup web test test-fast test-kernels test-lowest coverage lint format demo serve bench docs docs-site notebooks screenshots fuzz promises audit sbom compose-check slurm-check consumers-check
 .DELETE_ON_ERROR:
 
 help:  ## what there is
@@ -35,6 +35,9 @@ test: web  ## all tests; PYTEST="-k name" chooses
 
 test-fast: setup  ## within a minute: the tests that need no server and no browser and do not train
 	$(BIN)/python -m pytest -n logical --maxprocesses 4 --dist worksteal -m "not server and not browser and not slow" $(PYTEST)
+
+test-kernels: setup  ## the tests of the CPU kernels, compiled for a processor without AVX and fused products
+	NUMBA_CPU_NAME=nehalem NUMBA_CPU_FEATURES= $(BIN)/python -m pytest -n 0 tests/field/cpu tests/refinement/kernels $(PYTEST)
 
 test-lowest: build/lowest.txt  ## all tests with the lowest versions that pyproject.toml allows, in an environment of its own
 	NUMBA_CACHE_DIR=$(CURDIR)/build/lowest-kernels $(MAKE) test VENV=.venv-lowest CONSTRAINTS=build/lowest.txt
