@@ -15,7 +15,7 @@ from biresnerf.data.model.dataset import Dataset, Frame, IntrinsicsSource, Sourc
 from biresnerf.data.model.image_order import names_of_poses, natural_key
 from biresnerf.data.model.pose_validation import refuse_coinciding
 from biresnerf.data.photos.guessed_lens import guess_note
-from biresnerf.data.photos.masks import mask_beside
+from biresnerf.data.photos.masks import mask_beside, mask_notes
 from biresnerf.data.photos.named_images import refuse_outside, refuse_too_few
 from biresnerf.data.photos.photo_folders import all_photos, few_names, photos_beside, refuse_no_images
 from biresnerf.data.photos.shear import shear_notes
@@ -126,8 +126,6 @@ def dataset_of(
     refuse_coinciding([frame.world_from_cam for frame in frames if frame.world_from_cam is not None], place)
     # A folder of images alone never has poses or intrinsics.
     missing = _missing_notes(frames, photos, table or "images") if source.files else []
-    masked = sum(frame.mask is not None for frame in frames)
-    masks = [f"masks were found for {masked} of {len(frames)} images"] if masked else []
     lens_notes = [note for lens in photos.lenses for note in lens.notes]
     lens_notes += shear_notes([lens.camera for lens in photos.lenses])
     return Dataset(
@@ -135,7 +133,7 @@ def dataset_of(
         tuple(camera for camera, _, _ in cameras),
         tuple(frames),
         source,
-        tuple(dict.fromkeys([*notes, *photos.notes, *lens_notes, *missing, *masks])),
+        tuple(dict.fromkeys([*notes, *photos.notes, *lens_notes, *missing, *mask_notes(root, frames)])),
         tuple(by for _, by, _ in cameras),
     )
 

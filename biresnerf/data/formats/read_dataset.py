@@ -59,7 +59,10 @@ def read_dataset(
         dataset = codec.bind(without_problems(parsed, strict=strict), contents.root, within)
     for index, frame in enumerate(dataset.frames):
         refuse_unfit_mask(frame, dataset.camera_of(index))
-    used = [*contents.videos, *(frame.path for frame in dataset.frames)]
+    used = [
+        *contents.videos,
+        *(path for f in dataset.frames for path in (f.path, f.mask) if path is not None),
+    ]
     contents = replace(contents, notes=(*contents.notes, *position_notes(dataset)))
     left_out = () if path in contents.videos else left_out_notes(contents.root, used)
     return replace(dataset, warnings=(*contents.notes, *left_out, *dataset.warnings))

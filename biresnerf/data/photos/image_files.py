@@ -17,6 +17,7 @@ from PIL.TiffImagePlugin import TiffImageFile
 from biresnerf.data.photos.kinds import linear_light, raw_file
 from biresnerf.data.photos.kinds.photo_kinds import (
     HEIC,
+    PLAIN_SUFFIXES,
     RAW_SUFFIXES,
     image_suffixes,
     install_hint,
@@ -29,6 +30,7 @@ PLAIN_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 _MORE_FORMATS = (
     "AVIF", linear_light.ExrFile.format, linear_light.RadianceFile.format, linear_light.FloatTiffFile.format,
 )  # fmt: skip
+_JPEG = (".jpg", ".jpeg")
 MAX_IMAGE_PIXELS = 150_000_000  # beyond any camera; a guard against files that unpack to gigabytes
 EXIF_ORIENTATION = 0x0112
 _TIFF_WIDTH, _TIFF_HEIGHT = 0x0100, 0x0101
@@ -95,22 +97,46 @@ def is_image_name(path: Path) -> bool:
 
 def find_image(folder: Path, name: str) -> Path | None:
     """The file ``name`` means in ``folder``: as written, with slashes turned, or with an extension."""
+    return next(iter(images_called(folder, name)), None)
+
+
+def images_called(folder: Path, name: str) -> list[Path]:
+    """The files that ``name`` may mean in ``folder``, that of `find_image` first.
+
+    Of a JPEG and a PNG of one name, the PNG may be a mask or a depth: those in colour go first, then JPEG.
+    """
     if not name or "\0" in name:
-        return None
+        return []
     spellings = [name] + ([name.replace("\\", "/")] if "\\" in name else [])
     try:
         for spelling in spellings:
             path = folder / spelling
             if path.is_file():
-                return path
+                return [path]
+            found: dict[str, Path] = {}  # file systems may not tell letter cases apart
             for suffix in image_suffixes():
+                if found and suffix not in PLAIN_SUFFIXES:
+                    break
                 for variant in (suffix, suffix.upper()):
                     candidate = path.with_name(path.name + variant) if path.name else path
                     if candidate.is_file():
-                        return candidate
+                        found.setdefault(suffix, candidate)
+            if len(found) > 1:
+                return sorted(found.values(), key=lambda one: (is_grey(one), one.suffix.lower() not in _JPEG))
+            if found:
+                return list(found.values())
     except (OSError, ValueError):  # a name too long for the file system, or one of dots only
-        return None
-    return None
+        return []
+    return []
+
+
+def is_grey(path: Path) -> bool:
+    """Whether a picture can be opened and has one channel, as masks and depth maps have."""
+    try:
+        with quiet_pillow(), open_image(path, path.name) as image:
+            return image.mode in ("1", "L", "F") or image.mode.startswith("I")
+    except InputError:
+        return False
 
 
 def open_image(path: Path, name: str) -> Image.Image:

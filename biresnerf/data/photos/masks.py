@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,14 @@ from biresnerf.data.photos.image_files import (
     DAMAGED,
     find_image,
     header_of,
+    is_image_name,
     open_image,
     quiet_pillow,
     read_header,
 )
 from biresnerf.data.photos.named_images import lies_in, refuse_outside
 from biresnerf.data.photos.orientation import same_shape, turned, turned_size
+from biresnerf.data.photos.photo_folders import few_names, visible
 from biresnerf.data.photos.shear import straightened_mask
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
@@ -31,18 +34,48 @@ _LOSSY, _LOSSY_BLACK_BELOW = frozenset({"JPEG", "MPO", "WEBP"}), 128
 LEAST_SHARE = 1e-3  # of a photo's pixels must count: fewer are too few to measure anything
 _WHOLLY = 1 - 1e-6
 COLMAP_MASKS = "masks"  # masks/NAME.png, NAME with its own extension: black does not count
+_PICTURES = (".png", ".PNG", ".jpg", ".JPG", ".jpeg", ".tif")
+_MARKED = tuple(mark + suffix for mark in ("_mask", ".mask") for suffix in _PICTURES)
 
 
 def mask_beside(root: Path, image: Path, name: str, within: Path | None = None) -> tuple[Path | None, bool]:
     """The mask that lies ready for ``image``, and whether it is black where pixels do count.
 
-    That is ``root``/masks/``name``.png as for COLMAP, where black does not count; else instant-ngp's.
+    That is ``root``/masks/``name``.png as for COLMAP, or what other programs call it: masks/STEM.png and the like, or
+    NAME.mask.png (RealityCapture) or STEM_mask.jpg (OpenDroneMap) beside the photo; black does not count in all of
+    them. Else it is instant-ngp's.
     """
-    for stem in dict.fromkeys((name.removeprefix("images/"), name)):
-        candidate = root / COLMAP_MASKS / f"{stem}.png"
+    for candidate in _called(root, image, name):
         if _is_ready(candidate, within):
             return candidate, False
     return dynamic_mask(image, within)
+
+
+def _called(root: Path, image: Path, name: str) -> Iterator[Path]:
+    for path in dict.fromkeys((re.sub(r"^images(_\d+)?/", "", name), name)):
+        place = root / COLMAP_MASKS / path
+        yield place.with_name(f"{place.name}.png")
+        yield from (place.with_name(place.stem + end) for end in (*_PICTURES, *_MARKED))
+    yield image.with_name(f"{image.name}.mask.png")
+    yield from (image.with_name(image.stem + end) for end in _MARKED)
+
+
+def mask_notes(root: Path, frames: Sequence[Frame]) -> list[str]:
+    """How many photos have a mask, and which pictures in folders called so are none."""
+    used = {frame.mask.absolute() for frame in frames if frame.mask is not None}
+    masked = sum(frame.mask is not None for frame in frames)
+    notes = [f"masks were found for {masked} of {len(frames)} images"] if masked else []
+    for folder in visible(root):
+        if not folder.is_dir() or not re.search(r"(?<![a-z])masks?(?![a-z])", folder.name.lower()):
+            continue
+        pictures = [one for one in folder.rglob("*") if is_image_name(one) and one.absolute() not in used]
+        if pictures:
+            listed = few_names(sorted(one.relative_to(folder).as_posix() for one in pictures), 3)
+            notes.append(
+                f"{folder.name}/ holds {len(pictures)} pictures that are not used as masks ({listed}): give masks the "
+                "names of the photos, in masks/, or name them by mask_path in a transforms.json"
+            )
+    return notes
 
 
 def mask_place(frame: Frame) -> tuple[Path, bool]:

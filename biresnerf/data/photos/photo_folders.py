@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 
 from biresnerf.data.model.image_order import natural_key
-from biresnerf.data.photos.image_files import is_image_name
+from biresnerf.data.photos.image_files import is_grey, is_image_name
 from biresnerf.data.photos.kinds.photo_kinds import INSTALL, KIND_OF, PHOTO_KINDS, is_readable
 from biresnerf.data.photos.video.ffmpeg_frames import DEMUXERS
 from biresnerf.errors import InputError
@@ -18,17 +18,54 @@ from biresnerf.errors import InputError
 IMAGE_FOLDER = "images"
 # Folders of the photos themselves where others hold something else of the same views; the preferred one first.
 _USUAL = ("rgb", "color", "colour", "image", "image_2", "image_0", "train")
-# Folders whose pictures are not the set's photos; `biresnerf convert` writes pinhole/.
-_NO_PHOTOS = frozenset(
-    {"mask", "masks", "depth", "depths", "confidence", "normal", "normals", "semantic", "semantics", "label"}
-    | {"labels", "pinhole", "mask_visib", "sparse", "sparse_txt", "thumbnails", "__macosx"}
+# Words by which programs call what they make of photos: maps and small copies, in files beside them or in folders.
+_MAPS = frozenset(
+    {
+        "mask",
+        "masks",
+        "depth",
+        "depths",
+        "depthmap",
+        "depthmaps",
+        "disparity",
+        "conf",
+        "confidence",
+        "normal",
+        "normals",
+    }
+    | {
+        "semantic",
+        "semantics",
+        "segmentation",
+        "label",
+        "labels",
+        "thumb",
+        "thumbs",
+        "thumbnail",
+        "thumbnails",
+    }
 )
+# Other folders whose pictures are not the set's photos; `biresnerf convert` writes pinhole/.
+_NO_PHOTOS = frozenset({"pinhole", "sparse", "sparse_txt", "__macosx"})
 # Maps of something else beside a photo, as 7-Scenes, sdfstudio and instant-ngp name them.
 _NO_PHOTO = re.compile(
     r"^(dynamic_mask_.*|.*[._-](depth|normal|mask|sensor_depth|confidence)\.(png|tiff?))$", re.I
 )
-# Pictures that are no photos, by their extension.
-_NO_PICTURES = {".gif": "GIF"} | dict.fromkeys(DEMUXERS, "video")
+# Pictures that are not read and videos, by their extension.
+_NO_PICTURES = {
+    **{
+        ".gif": "GIF",
+        ".jxl": "JPEG XL",
+        ".jxr": "JPEG XR",
+        ".psd": "Photoshop",
+        ".tga": "TGA",
+        ".svg": "SVG",
+    },
+    **{".pdf": "PDF", ".dcm": "DICOM", ".fits": "FITS", ".insp": "Insta360", ".dds": "DDS", ".xcf": "GIMP"},
+    **dict.fromkeys((".jp2", ".j2k", ".j2c", ".jpf", ".jpx"), "JPEG 2000"),
+    **dict.fromkeys((".ppm", ".pgm", ".pnm", ".pbm"), "PNM"),
+    **dict.fromkeys(DEMUXERS, "video"),
+}
 _MOST_ENTRIES = 100_000  # looked at for a message
 
 
@@ -69,7 +106,7 @@ def all_photos(root: Path) -> dict[str, Path]:
 
 def folders_of_photos(root: Path) -> dict[str, list[Path]]:
     """The photos below each folder of ``root``, but folders that hold no photos."""
-    folders = [path for path in visible(root) if path.is_dir() and path.name.lower() not in _NO_PHOTOS]
+    folders = [path for path in visible(root) if path.is_dir() and not _holds_no_photos(path.name)]
     return {folder.name: paths for folder in folders if (paths := images_below(folder))}
 
 
@@ -111,23 +148,56 @@ def images_below(folder: Path) -> list[Path]:
 
 
 def _once(paths: Sequence[Path]) -> list[Path]:
-    """The photos but those that are there in a kind that more programs read."""
-    doubles = doubled(paths)
-    return sorted(set(paths) - doubles.keys(), key=lambda path: natural_key(path.as_posix()))
+    """The photos but maps of them and those that are there in a kind that more programs read."""
+    photos = set(paths) - maps_among(paths)
+    return sorted(photos - doubled(photos).keys(), key=lambda path: natural_key(path.as_posix()))
+
+
+def maps_among(paths: Iterable[Path]) -> set[Path]:
+    """Pictures that are called as a map or a small copy of a photo beside them: r_0_depth_0001.png beside r_0.png.
+
+    The photo has the same numbers in its name, or the first of them; names without numbers have the same other words.
+    """
+    words_of = {path: _words(path.stem) for path in paths}
+    called = {path for path, words in words_of.items() if _MAPS & set(words)}
+    photos = {(path.parent, _apart(path.stem)) for path in words_of.keys() - called}
+    return {
+        path
+        for path in called
+        for what in [_apart(path.stem)]
+        if any((path.parent, what[:end]) in photos for end in range(1, len(what) + 1))
+    }
+
+
+def _words(name: str) -> list[str]:
+    return re.findall(r"[^\W\d_]+", name.casefold())
+
+
+def _apart(stem: str) -> tuple[int | str, ...]:
+    """What tells a name from others of its kind: its numbers, else its words."""
+    return tuple(map(int, re.findall(r"\d+", stem))) or tuple(w for w in _words(stem) if w not in _MAPS)
+
+
+def _holds_no_photos(folder: str) -> bool:
+    return folder.casefold() in _NO_PHOTOS or not _MAPS.isdisjoint(_words(folder))
 
 
 def doubled(paths: Iterable[Path]) -> dict[Path, Path]:
     """Photos that lie beside the same photo in another kind (HEIC and JPEG), with the one that is used instead.
 
-    The same name in the same folder is the same photo, unless both are PNG, JPEG and the like.
+    The same name in the same folder is the same photo, unless both are PNG, JPEG and the like in colour: a grey one
+    beside one in colour is its mask or depth.
     """
     same: dict[tuple[Path, str], list[Path]] = defaultdict(list)
     for path in paths:
         same[path.parent, path.stem.casefold()].append(path)
     found: dict[Path, Path] = {}
     for group in same.values():
-        first = min(group, key=_preference)
-        found |= {path: first for path in group if path != first and _preference(path)}
+        plain = [path for path in group if not _preference(path)]
+        grey = {path for path in plain if is_grey(path)} if len(plain) > 1 else set()
+        grey = set() if len(grey) == len(plain) else grey
+        first = min(group, key=lambda path: (path in grey, _preference(path)))
+        found |= {path: first for path in group if path != first and (path in grey or _preference(path))}
     return found
 
 
@@ -145,7 +215,7 @@ def is_photo_name(name: str) -> bool:
 def _files_below(folder: Path) -> Iterator[Path]:
     for parent, folders, files in os.walk(folder):
         folders[:] = sorted(
-            name for name in folders if not name.startswith(".") and name.lower() not in _NO_PHOTOS
+            name for name in folders if not name.startswith(".") and not _holds_no_photos(name)
         )
         yield from (Path(parent, name) for name in files if not name.startswith("."))
 
@@ -181,6 +251,13 @@ def left_out_notes(folder: Path, used: Iterable[Path] = ()) -> tuple[str, ...]:
         for kind, names in unread.items()
     ]
     photos = [path for path in islice(_files_below(folder), _MOST_ENTRIES) if is_photo_name(path.name)]
+    maps = sorted(
+        path.relative_to(folder).as_posix() for path in maps_among(photos) if path.absolute() not in taken
+    )
+    if maps:
+        notes.append(
+            f"{len(maps)} pictures are called as maps of photos beside them and are left out: {few_names(maps, 3)}"
+        )
     doubles = [
         f"{one.relative_to(folder).as_posix()} ({other.name} is used)"
         for one, other in sorted(doubled(photos).items())
@@ -201,9 +278,8 @@ def unused_image_notes(paths: Sequence[Path], others: Iterable[Path] = ()) -> li
     suffixes = {path.suffix.lower() for path in paths}
     unused = []
     for folder in sorted({path.parent.absolute() for path in paths}):
-        for path in sorted(folder.iterdir()):
-            image = path.suffix.lower() in suffixes and is_photo_name(path.name)
-            if image and path.is_file() and path.resolve() not in used:
+        for path in images_in(folder):
+            if path.suffix.lower() in suffixes and path.resolve() not in used:
                 unused.append(path.name)
     if not unused:
         return []
@@ -218,6 +294,14 @@ def refuse_no_images(files: dict[str, Path], root: Path) -> None:
         raise no_images(root, "there are poses, but no photo")
 
 
+def _seen(path: Path) -> str:
+    """A file's name; of a folder also what kinds of files lie in it."""
+    if not path.is_dir():
+        return path.name
+    kinds = Counter(one.suffix.lower() or "no extension" for one in islice(_files_below(path), _MOST_ENTRIES))
+    return f"{path.name}/ ({few_names((f'{n} {kind}' for kind, n in kinds.most_common()), 3) or 'empty'})"
+
+
 def no_images(root: Path, what: str) -> InputError:
     """The error for a folder in which no photos were found, with what was seen there."""
     folders = list(folders_of_photos(root))
@@ -228,11 +312,12 @@ def no_images(root: Path, what: str) -> InputError:
     kinds = pictures_left_out(root)
     if kinds:
         seen = "; ".join(f"{len(names)} {kind} ({few_names(names, 3)})" for kind, names in kinds.items())
-        hint = "Save them as PNG or JPEG, at full size; from a video, save sharp frames that overlap."
+        hint = "Save them as PNG or JPEG, at full size"
+        hint += "; from a video, save sharp frames that overlap." if "video" in kinds else "."
         if any(_how_to_read(kind) for kind in kinds):
             hint = f"Run `{INSTALL}`, or save them as PNG or JPEG, at full size."
         return InputError("no_images", f"{what} that is read: {seen}.", where=str(root), hint=hint)
-    seen = few_names((path.name + "/" * path.is_dir() for path in visible(root)), 8)
+    seen = few_names(map(_seen, visible(root)), 8)
     return InputError(
         "no_images",
         f"{what} that is read: it holds {seen or 'nothing'}.",

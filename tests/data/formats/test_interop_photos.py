@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from biresnerf.data.formats.read_dataset import read_dataset
+from biresnerf.errors import InputError
 from tests.data.test_real_sets import ROOT
 
 CASES = ROOT / "interop"
@@ -20,6 +21,14 @@ if not CASES.is_dir():
 READ = {
     "30_unpadded_numbers/kitti": (12, 12, "as numbers (frame_2.jpg before frame_10.jpg)"),
     "30_unpadded_numbers/log": (12, 12, "as numbers (2.jpg before 10.jpg)"),
+    "37_pictures_that_are_no_photos/nerf_synthetic_test": (6, 0, "12 pictures are called as maps"),
+    "37_pictures_that_are_no_photos/odm_masks": (6, 0, "masks were found for 6 of 6"),
+    "38_masks_under_other_names/stem": (6, 6, "masks were found for 6 of 6"),
+    "38_masks_under_other_names/beside": (6, 6, "masks were found for 6 of 6"),
+    "46_png_beside_jpg/set": (6, 6, "0001.jpg (not 0001.png)"),
+}
+REFUSED = {
+    "45_unread_kinds_in_images/jp2": ("no_images", "4 JPEG 2000 (images/0001.jp2"),
 }
 
 
@@ -36,3 +45,13 @@ def test_a_case_is_read_with_its_true_poses_and_says_what_was_done(name):
         assert frame.path.name in expected
         if frame.world_from_cam is not None:
             np.testing.assert_allclose(frame.world_from_cam, expected[frame.path.name], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_case_that_cannot_be_read_is_refused_by_its_name(name):
+    code, said = REFUSED[name]
+    with pytest.raises(InputError) as caught:
+        read_dataset(CASES / name)
+    assert caught.value.code == code
+    assert said in caught.value.detail
+    assert caught.value.hint.endswith(".")

@@ -202,6 +202,42 @@ def test_colmap_is_given_full_size_masks_under_its_own_names(tmp_path):
     assert not write_masks(_masked_set(tmp_path, {}), names, tmp_path / "none")
 
 
+@pytest.mark.parametrize(
+    "mask",
+    [
+        "masks/{name}.png",
+        "masks/{stem}.png",
+        "masks/{stem}_mask.JPG",
+        "images/{name}.mask.png",
+        "images/{stem}_mask.png",
+    ],
+)
+def test_masks_are_found_under_the_names_that_other_programs_give_them(tmp_path, mask):
+    for number in range(3):
+        path = tmp_path / mask.format(name=f"{number}.jpg", stem=number)
+        path.parent.mkdir(exist_ok=True)
+        _stored(BLOCKS, "L").save(path)
+        (tmp_path / "images").mkdir(exist_ok=True)
+        Image.new("RGB", (WIDTH, HEIGHT), (90, 9, 200)).save(tmp_path / f"images/{number}.jpg")
+    dataset = read_dataset(tmp_path)
+    assert len(dataset) == 3
+    for index, frame in enumerate(dataset.frames):
+        assert np.array_equal(load_mask(frame, dataset.camera_of(index)), BLOCKS)
+    assert dataset.warnings == ("masks were found for 3 of 3 images",)
+
+
+def test_pictures_among_the_masks_that_fit_no_photo_are_said(tmp_path):
+    document = nerfstudio_scene(tmp_path)
+    for folder in ("masks", "object_mask"):
+        (tmp_path / folder).mkdir()
+        _stored(PATTERN, "L").save(tmp_path / folder / "x_1.png")
+    warnings = read_dataset(save(tmp_path, document)).warnings
+    for folder in ("masks", "object_mask"):
+        assert any(
+            f"{folder}/ holds 1 pictures that are not used as masks (x_1.png)" in text for text in warnings
+        )
+
+
 FEATURES = """
 import zlib, json, sys  # zlib first: pycolmap's own breaks Python's
 import pycolmap

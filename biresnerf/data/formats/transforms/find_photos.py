@@ -10,7 +10,7 @@ from pathlib import Path
 from biresnerf.data.formats.bad_frames import attempt, good_frames, tolerate
 from biresnerf.data.formats.match_names import ENDS, SAME_PATH, match_files
 from biresnerf.data.formats.parsed_poses import PoseEntry
-from biresnerf.data.photos.image_files import find_image
+from biresnerf.data.photos.image_files import images_called
 from biresnerf.data.photos.named_images import lies_in, refuse_outside
 from biresnerf.data.photos.photo_folders import by_path, few_names, images_below
 from biresnerf.errors import InputError
@@ -34,12 +34,16 @@ def find_photos(
     outcomes = [attempt(partial(_with_name, entry)) for entry in entries]
     entries, _, nameless = good_frames(outcomes, ["a frame"] * len(entries), strict=strict)
     outside = {entry.name for entry in entries if within is not None and _leads_out(file, entry.name, within)}
-    found = {
-        entry.name: path
-        for entry in entries
-        if entry.name not in outside and (path := find_image(file.parent, entry.name)) is not None
+    called = {
+        entry.name: images_called(file.parent, entry.name) for entry in entries if entry.name not in outside
     }
+    found = {name: paths[0] for name, paths in called.items() if paths}
     notes = _find_elsewhere(file, [entry.name for entry in entries], found, within)
+    several = [f"{path[0].name} (not {path[1].name})" for path in called.values() if len(path) > 1]
+    if several:
+        notes.append(
+            f"{len(several)} names without extension fit several files; taken are {few_names(several, 3)}"
+        )
     if outside and not outside & found.keys():
         first = next(entry for entry in entries if entry.name in outside)
         assert within is not None
