@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from biresnerf.errors import InputError
 from biresnerf.wire.safe_paths import NameSet, checked_path
@@ -41,8 +41,9 @@ def look_at(path: Path, video_frames: int = 0) -> Scene:
     poses = [(_name_below(root, file), file) for file in dataset.source.files]
     if dataset.source.file is not None:
         # The service looks for the pose file by its usual name.
-        name = dataset.source.file.name
-        poses = [(name if name.startswith("transforms") else TRANSFORMS, dataset.source.file)]
+        name = PurePosixPath(_name_below(root, dataset.source.file))
+        usual = name if name.name.startswith("transforms") else name.with_name(TRANSFORMS)
+        poses = [(str(usual), dataset.source.file)]
     elif dataset.source.files and not path.is_dir():
         poses = _found_by_name(root, path, poses)
     positions = position_file(root)

@@ -17,7 +17,7 @@ from biresnerf.data.model.pose_validation import refuse_coinciding
 from biresnerf.data.photos.guessed_lens import guess_note
 from biresnerf.data.photos.masks import mask_beside, mask_notes
 from biresnerf.data.photos.named_images import refuse_outside, refuse_too_few
-from biresnerf.data.photos.photo_folders import all_photos, few_names, photos_beside, refuse_no_images
+from biresnerf.data.photos.photo_folders import few_names, photos_beside, photos_named, refuse_no_images
 from biresnerf.data.photos.shear import shear_notes
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
@@ -35,7 +35,7 @@ def bind_images(parsed: ParsedPoses, root: Path, within: Path | None = None) -> 
     named = parsed.assign is None
     files = photos_beside(root, parsed.photo_folders)
     if named and not files:
-        files = all_photos(root)
+        files = photos_named(root, [entry.name for entry in parsed.entries])
     refuse_no_images(files, root)
     names = sorted(files, key=natural_key)
     assign = parsed.assign or partial(by_name, parsed.entries, strict=parsed.strict)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
@@ -10,10 +11,14 @@ from pathlib import Path
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.registry import ALL_CODECS
 from biresnerf.data.formats.unread_poses import refuse_unread
+from biresnerf.data.photos.named_images import lies_in
 from biresnerf.data.photos.photo_folders import (
     IMAGE_FOLDER,
+    all_photos,
     few_names,
     folders_of_photos,
+    images_beside,
+    is_photo_name,
     no_images,
     photos_beside,
     visible,
@@ -23,6 +28,11 @@ from biresnerf.errors import InputError
 
 # Folders that are part of the names of photos, also where there is nothing beside them.
 _NAMED_IN_SETS = (IMAGE_FOLDER, VIDEO_FRAMES)
+_DEPTH = 4  # of folders in which poses of a set are looked for: dslr/colmap/, dense/0/sparse/
+_MOST_FOLDERS = 2_000
+_RESULT = {"report.json", "config.json"}  # what a result of ours holds
+# Formats known by names that many programs use: looked for where the user points, not in all folders below.
+_LOOSE = ("trajectory",)
 
 
 @dataclass(frozen=True)
@@ -59,11 +69,12 @@ def look_into(folder: Path) -> FolderContents:
         if len(entries) != 1 or not entries[0].is_dir() or entries[0].name in _NAMED_IN_SETS:
             break
         root = entries[0]
-    found = list(_pose_places(root))
+    found = _found(root)
     if found:
-        name, place = found[0]
-        image_root = ALL_CODECS[name].image_root(place) if place == root else root
-        return FolderContents(image_root, name, place, (), _notes(root, found))
+        first = found[0]
+        return FolderContents(
+            _with_photos(first.root, root), first.format, first.place, (), _notes(root, found)
+        )
     refuse_unread(root)
     images, videos, notes = _photos_alone(root)
     if not images and not videos:
@@ -99,8 +110,10 @@ def _videos_beside(root: Path, videos: Sequence[Path], photos: Sequence[Path]) -
     return [path for path in videos if path.stem.casefold() not in names]
 
 
-def look_at(file: Path) -> FolderContents:
+def look_at(file: Path, within: Path | None = None) -> FolderContents:
     """What the user means by naming one file: poses, in the format of its name, with images beside it; or a video.
+
+    Where its folder holds no photo, those of the folder above may be meant, unless that leads out of ``within``.
 
     Raises:
         InputError: ``input_unsupported``.
@@ -122,13 +135,25 @@ def look_at(file: Path) -> FolderContents:
     for name, codec in sorted(readable, key=doubt):
         place = codec.place_of(file)
         if place is not None:
-            return FolderContents(codec.image_root(place), name, place, (), ())
+            return FolderContents(_or_above(codec.image_root(place), within), name, place, (), ())
     raise InputError(
         "input_unsupported",
         "is neither a folder nor a file with poses that is read.",
         where=file.name,
         hint="Give a transforms.json, a video, or a folder that holds poses or images.",
     )
+
+
+def _or_above(root: Path, within: Path | None) -> Path:
+    """``root``, or the folder above it where only that one holds photos, or one of its folders."""
+    above = root.absolute().parent
+    if all_photos(root) or (within is not None and not lies_in(above, within.resolve())):
+        return root
+    try:
+        holds = any(map(images_beside, [above, *(path for path in visible(above) if path.is_dir())]))
+    except InputError:  # not ours to read
+        return root
+    return above if holds else root
 
 
 def usual_name(file: Path) -> str | None:
@@ -139,19 +164,85 @@ def usual_name(file: Path) -> str | None:
     return ALL_CODECS[contents.format].format.found_as[0].replace("*", "cameras")
 
 
-def _pose_places(root: Path) -> Iterator[tuple[str, Path]]:
-    """All poses in ``root`` by the name of their format, those that are preferred first."""
+@dataclass(frozen=True)
+class _Found:
+    """Poses of a format in the file or folder ``place``; photos lie in or below ``root``, if there are some."""
+
+    format: str
+    place: Path
+    root: Path
+
+
+def _found(root: Path) -> list[_Found]:
+    """All poses of a set, the first of which is read: those in ``root`` itself, else the nearest in folders below.
+
+    A model without photos beside it gives way to one that has some, as a program that straightens photos writes.
+    """
+    here = list(_pose_places(root))
+    if here and (ALL_CODECS[here[0].format].count is None or images_beside(here[0].root)):
+        return here
+    below = [
+        one for folder in _folders_below(root) for one in _pose_places(folder) if one.format not in _LOOSE
+    ]
+    wanted = [one for one in below if one.format == (here or below)[0].format] if here or below else []
+    count = ALL_CODECS[wanted[0].format].count if wanted else None
+    if here:
+        return [*(one for one in wanted if images_beside(one.root)), *here]
+    if count is not None:
+        best = max(wanted, key=lambda one: (bool(images_beside(one.root)), count(one.place)))
+        below.sort(key=lambda one: one != best)
+    return below
+
+
+def _folders_below(root: Path) -> list[Path]:
+    """The folders below ``root`` that may hold poses of the set, the nearest first; results of ours are none."""
+    found: list[Path] = []
+    for parent, folders, files in os.walk(root):
+        here = Path(parent)
+        if set(files) >= _RESULT or len(found) > _MOST_FOLDERS:
+            folders.clear()
+            continue
+        if here != root and (folders or not all(map(is_photo_name, files))):
+            found.append(here)
+        inner = [] if len(here.relative_to(root).parts) == _DEPTH else folders
+        folders[:] = sorted(name for name in inner if not name.startswith((".", "__")))
+    return sorted(found, key=lambda folder: (len(folder.parts), folder))
+
+
+def _with_photos(folder: Path, top: Path) -> Path:
+    """``folder``, or the nearest above it, up to ``top``, that holds photos where it holds none."""
+    for place in (folder, *folder.parents):
+        if place == top or not place.is_relative_to(top) or all_photos(place):
+            return place
+    return folder
+
+
+def _pose_places(root: Path) -> Iterator[_Found]:
+    """The poses in the folder ``root``, those that are preferred first."""
     for name, codec in ALL_CODECS.items():
         for pattern in codec.format.found_as:
             places = [root / pattern]
             if set("*[") & set(pattern):
                 places = [path for path in visible(root) if fnmatch(path.name.lower(), pattern)]
-            yield from ((name, place) for place in places if codec.recognises(place))
+            for place in places:
+                if codec.recognises(place):
+                    yield _Found(
+                        name, _largest(codec, place), codec.image_root(place) if place == root else root
+                    )
 
 
-def _notes(root: Path, found: list[tuple[str, Path]]) -> tuple[str, ...]:
-    if len(found) == 1:
-        return ()
-    read, *others = (path.relative_to(root).as_posix() for _, path in found)
+def _largest(codec: Codec, place: Path) -> Path:
+    """Of places that a number alone tells apart (sparse/0, sparse/1), that with most images."""
+    if codec.count is None or not place.name.isdecimal():
+        return place
+    numbered = [path for path in visible(place.parent) if path.name.isdecimal() and codec.recognises(path)]
+    return max(sorted(numbered, key=lambda path: int(path.name)), key=codec.count)
+
+
+def _notes(root: Path, found: Sequence[_Found]) -> tuple[str, ...]:
+    names = dict.fromkeys(one.place.relative_to(root).as_posix() for one in found)
+    read, *others = ("the folder itself" if name == "." else name for name in names)
+    if not others:
+        return (f"{read} was read",) if root not in (found[0].root, found[0].place) else ()
     were = "was not" if len(others) == 1 else "were not"
-    return (f"{read} was read and {', '.join(others)} {were}",)
+    return (f"{read} was read and {few_names(others, 12)} {were}",)

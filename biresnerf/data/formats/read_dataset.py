@@ -48,7 +48,7 @@ def read_dataset(
     Raises:
         InputError: the input cannot be used; says the file, the field and a hint.
     """
-    contents = find_input(Path(path))
+    contents = find_input(Path(path), within)
     if contents.format is None or contents.poses is None:
         images, notes = _with_video_frames(contents, within, videos)
         dataset = _read_images(contents.root, images, within, strict=strict)
@@ -136,10 +136,10 @@ def seen_points(path: Path) -> dict[str, set[int]]:
     return {posixpath.normpath(one.name): {*one.point3d_ids.tolist()} - {NO_POINT} for one in images}
 
 
-def find_input(path: Path) -> FolderContents:
+def find_input(path: Path, within: Path | None = None) -> FolderContents:
     """What of ``path`` is read. Raises InputError where nothing is there that can be."""
     if path.is_file():
-        return look_at(path)
+        return look_at(path, within)
     if path.is_dir():
         return look_into(path)
     raise InputError(

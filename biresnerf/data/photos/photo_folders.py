@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import posixpath
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
@@ -102,6 +103,32 @@ def all_photos(root: Path) -> dict[str, Path]:
     return photos_beside(root) or by_path(
         root, [path for paths in folders_of_photos(root).values() for path in paths]
     )
+
+
+def photos_named(root: Path, names: Sequence[str]) -> dict[str, Path]:
+    """The photos of the folder below ``root`` that holds more than half of ``names``, by their path there; else all.
+
+    Extensions and case may differ, and where no paths fit, file names do. Of several such folders (images_2/,
+    images_4/), that of the largest files counts.
+    """
+    below = images_below(root)
+    for whole in (True, False):
+        wanted = {_bare(name if whole else posixpath.basename(name)) for name in names}
+        found: dict[Path, list[Path]] = defaultdict(list)
+        for path in below:
+            for folder in path.relative_to(root).parents if whole else [path.parent.relative_to(root)]:
+                if _bare(path.relative_to(root / folder).as_posix()) in wanted:
+                    found[folder].append(path)
+        most = max(map(len, found.values()), default=0)
+        if 2 * most > len(wanted):
+            best = [folder for folder, paths in found.items() if len(paths) == most]
+            folder = root / max(best, key=lambda one: found[one][0].stat().st_size)
+            return by_path(folder, [path for path in below if path.is_relative_to(folder)])
+    return all_photos(root)
+
+
+def _bare(name: str) -> str:
+    return posixpath.splitext(name.replace("\\", "/").casefold())[0]
 
 
 def folders_of_photos(root: Path) -> dict[str, list[Path]]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.colmap.read_colmap import bind_colmap, parse_colmap
-from biresnerf.data.formats.colmap.read_model import model_file_formats
+from biresnerf.data.formats.colmap.read_model import image_count, model_file_formats
 from biresnerf.data.formats.colmap.write_binary import write_colmap_binary
 from biresnerf.data.formats.colmap.write_text import write_colmap_text
 from biresnerf.data.photos.photo_folders import IMAGE_FOLDER, images_in
@@ -52,6 +52,7 @@ def _model_folder(file: Path) -> Path | None:
 def _image_root(folder: Path) -> Path:
     """The folder with images/ that holds a model's folder in one of the usual places."""
     parts = Path(os.path.abspath(folder)).parts
+    parts = (*parts[:-1], "0") if parts[-1].isdecimal() else parts  # sparse/1 lies where sparse/0 does
     tails = [Path(name).parts for name in COLMAP.found_as]
     roots = [folder] + [Path(*parts[: -len(tail)]) for tail in tails if tail and parts[-len(tail) :] == tail]
     with_images = (root for root in roots if (root / IMAGE_FOLDER).is_dir() or images_in(root))
@@ -66,6 +67,7 @@ CODECS = (
         recognises=lambda place: bool(model_file_formats(place)),
         pose_place=_model_folder,
         image_root=_image_root,
+        count=image_count,
         write=lambda refined, path, _: write_colmap_binary(refined.model, path),
     ),
     Codec(

@@ -7,14 +7,21 @@ from dataclasses import replace
 from pathlib import Path
 
 from biresnerf.data.formats.bind_images import by_name, dataset_of
-from biresnerf.data.formats.colmap.read_model import read_colmap_model
+from biresnerf.data.formats.colmap.read_model import image_count, read_colmap_model
+from biresnerf.data.formats.match_names import match_files
 from biresnerf.data.formats.parsed_poses import ParsedPoses, PoseEntry
 from biresnerf.data.model.colmap_scene import ColmapModel
 from biresnerf.data.model.dataset import Dataset, SourceFormat
 from biresnerf.data.model.part_of_model import without_images
 from biresnerf.data.photos.image_files import read_header
 from biresnerf.data.photos.orientation import same_shape
-from biresnerf.data.photos.photo_folders import IMAGE_FOLDER, few_names, images_beside, refuse_no_images
+from biresnerf.data.photos.photo_folders import (
+    IMAGE_FOLDER,
+    few_names,
+    images_beside,
+    photos_named,
+    refuse_no_images,
+)
 from biresnerf.errors import InputError
 
 
@@ -40,7 +47,8 @@ def parse_colmap(_root: Path, model_folder: Path) -> ParsedPoses:
 def bind_colmap(parsed: ParsedPoses, root: Path, within: Path | None = None) -> Dataset:
     """The images of a model, and the unregistered ones beside them, without pose.
 
-    Images lie in ``root``/images, or in ``root`` itself and those of its folders that the model names.
+    Images lie in ``root``/images, or in ``root`` itself and those of its folders that the model names; else in the
+    folder that holds most of the model's names.
 
     Raises:
         InputError: codes as in docs/input.md.
@@ -54,6 +62,9 @@ def bind_colmap(parsed: ParsedPoses, root: Path, within: Path | None = None) -> 
     # Without images/, the model's folders of images lie in the root itself.
     elsewhere = {entry.name: root / entry.name for entry in parsed.entries if entry.name not in files}
     files |= {name: path for name, path in elsewhere.items() if path.is_file()}
+    names = [entry.name for entry in parsed.entries]
+    if not match_files(names, list(files))[0]:
+        files = photos_named(root, names)
     refuse_no_images(files, root)
     pairs, notes = by_name(parsed.entries, list(files), strict=parsed.strict)
     model = without_images(model, {entry.name for entry in parsed.entries} - {one.name for _, one in pairs})
@@ -110,13 +121,14 @@ def _likely_camera(model: ColmapModel, path: Path, name: str) -> int | None:
 
 def _beside_notes(model_folder: Path) -> list[str]:
     """A note on further models: COLMAP writes sparse/1, sparse/2 where not all images hold together."""
-    if model_folder.name != "0":
+    if not model_folder.name.isdecimal():
         return []
+    numbered = [path for path in model_folder.parent.iterdir() if path.name.isdecimal()]
     others = sorted(
-        path.name for path in model_folder.parent.iterdir() if path.name.isdecimal() and path.name != "0"
+        (path for path in numbered if path.name != model_folder.name), key=lambda path: int(path.name)
     )
     if not others:
         return []
-    return [
-        f"the model {model_folder.parent.name}/0 was read and the models {few_names(others)} beside it were not"
-    ]
+    read, folder = f"{model_folder.parent.name}/{model_folder.name}", model_folder.parent.name
+    listed = few_names(f"{folder}/{path.name} ({image_count(path)})" for path in others)
+    return [f"the model {read} ({image_count(model_folder)} images) was read, and not {listed}"]

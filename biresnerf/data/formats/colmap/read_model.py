@@ -35,6 +35,17 @@ def model_file_formats(folder: Path) -> tuple[colmap.ModelFileFormat, ...]:
     )
 
 
+def image_count(folder: Path) -> int:
+    """How many images the model in ``folder`` has, by the beginning of its table or the number of its lines."""
+    found = model_file_formats(folder)
+    if not found:
+        return 0
+    with (folder / f"images{_SUFFIXES[found[0]]}").open("rb") as file:
+        if found[0] == "binary":
+            return int.from_bytes(file.read(8), "little")
+        return (1 + sum(not line.startswith(b"#") for line in file)) // 2
+
+
 def read_colmap_model(folder: Path) -> colmap.ColmapModel:
     """The model in ``folder``; binary where it holds both file formats, and a note says so.
 

@@ -17,13 +17,14 @@ from biresnerf.errors import InputError
 
 
 def find_photos(
-    file: Path, entries: Sequence[PoseEntry], within: Path | None, *, strict: bool
+    file: Path, root: Path, entries: Sequence[PoseEntry], within: Path | None, *, strict: bool
 ) -> tuple[list[tuple[Path, PoseEntry]], list[str]]:
     """The entries with the photos that they name, and notes; those whose photo is missing are left out.
 
     A path is looked for as it is written, relative to the file. If nothing is there: for a path inside the file's
     folder the same in another case or Unicode form; for one that leads out of it, as paths of another machine do, a
-    photo of the same end, if one alone has it.
+    photo of the same end, if one alone has it. Where the file's folder holds no photo at all, the same for every path
+    in ``root``, a folder above.
 
     Args:
         within: look at no path outside of this folder; for uploaded sets.
@@ -38,7 +39,7 @@ def find_photos(
         entry.name: images_called(file.parent, entry.name) for entry in entries if entry.name not in outside
     }
     found = {name: paths[0] for name, paths in called.items() if paths}
-    notes = _find_elsewhere(file, [entry.name for entry in entries], found, within)
+    notes = _find_elsewhere(file, root, [entry.name for entry in entries], found, within)
     several = [f"{path[0].name} (not {path[1].name})" for path in called.values() if len(path) > 1]
     if several:
         notes.append(
@@ -82,7 +83,7 @@ def _leads_out(file: Path, name: str, within: Path) -> bool:
 
 
 def _find_elsewhere(
-    file: Path, names: Sequence[str], found: dict[str, Path], within: Path | None
+    file: Path, root: Path, names: Sequence[str], found: dict[str, Path], within: Path | None
 ) -> list[str]:
     """Adds what other spellings find to ``found``; returns notes."""
     missing = [name for name in names if name not in found]
@@ -90,13 +91,15 @@ def _find_elsewhere(
         return []
     used = {path.resolve() for path in found.values()}
     limit = None if within is None else within.resolve()
-    files = by_path(file.parent, images_below(file.parent))
+    beside = images_below(file.parent)
+    above = not beside and root != file.parent and file.is_relative_to(root)
+    files = by_path(root, images_below(root)) if above else by_path(file.parent, beside)
     free = [
         name
         for name, path in files.items()
         if path.resolve() not in used and (limit is None or lies_in(path, limit))
     ]
-    far = [name for name in missing if _of_another_machine(name)]
+    far = [name for name in missing if above or _of_another_machine(name)]
     notes = []
     for some, rules in ((far, ENDS), ([name for name in missing if name not in far], SAME_PATH)):
         matched, said = match_files(some, free, rules)

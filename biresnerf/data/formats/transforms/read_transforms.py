@@ -90,7 +90,7 @@ def bind_transforms(parsed: ParsedPoses, root: Path, within: Path | None = None)
     refuse_too_few(len(parsed.entries), f"{path.name} frames")
     if within is not None:
         refuse_more_than_files(path, len(parsed.entries), within)
-    pairs, found = find_photos(path, parsed.entries, within, strict=parsed.strict)
+    pairs, found = find_photos(path, root, parsed.entries, within, strict=parsed.strict)
     parsed = _with_older_transform(replace(parsed, entries=tuple(entry for _, entry in pairs)))
     masked = [
         attempt(partial(_with_mask, path, entry, image, within))
