@@ -21,6 +21,10 @@ if not CASES.is_dir():
 READ = {
     "30_unpadded_numbers/kitti": (12, 12, "as numbers (frame_2.jpg before frame_10.jpg)"),
     "30_unpadded_numbers/log": (12, 12, "as numbers (2.jpg before 10.jpg)"),
+    "35_geo_txt/epsg_4258": (8, 8, "measured positions of 8 of 8"),
+    "35_geo_txt/no_height": (8, 8, "geo.txt line 2 has no height"),
+    "35_geo_txt/proj_header": (8, 8, "measured positions of 8 of 8"),
+    "36_unrelated_gps_csv/logger": (8, 8, "names no photo of the set"),
     "37_pictures_that_are_no_photos/nerf_synthetic_test": (6, 0, "12 pictures are called as maps"),
     "37_pictures_that_are_no_photos/odm_masks": (6, 0, "masks were found for 6 of 6"),
     "38_masks_under_other_names/stem": (6, 6, "masks were found for 6 of 6"),

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from biresnerf.data.formats.photogrammetry.metashape import cameras_by_label, the_chunk
-from biresnerf.data.formats.positions.position_table import EPSG, WGS84, PositionTable
+from biresnerf.data.formats.positions.position_table import EPSG, WGS84, PositionTable, is_geographic
 from biresnerf.data.model.untrusted_file import finite_numbers
 from biresnerf.data.photos.geotags import MeasuredPlace
 
@@ -23,7 +23,7 @@ def read_references(file: Path) -> PositionTable | None:
     system = chunk.findtext("reference", "").strip()
     if not system:
         return None
-    degrees, numbers = system.startswith("GEOGCS"), re.findall(EPSG, system)
+    degrees, numbers = is_geographic(system), re.findall(EPSG, system)
     axes = "yxz" if degrees else "xyz"
     properties = {one.get("name"): one.get("value") for one in chunk.iter("property")}
     places: dict[str, MeasuredPlace] = {}

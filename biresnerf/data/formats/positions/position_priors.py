@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +14,13 @@ from biresnerf.data.formats.positions.metashape_references import read_reference
 from biresnerf.data.formats.positions.position_table import (
     WGS84,
     PositionTable,
-    position_file,
+    position_files,
     read_position_table,
 )
 from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.model.untrusted_file import read_text
 from biresnerf.data.photos.geotags import MeasuredPlace, read_geotag
+from biresnerf.errors import InputError
 from biresnerf.geometry.earth.geodesy import east_north_up
 
 
@@ -54,27 +58,53 @@ def position_priors(dataset: Dataset) -> PositionPriors | None:
     Raises:
         InputError: ``positions_invalid``, or a code of `open_image`.
     """
-    for table in (_of_table(dataset), _of_metashape(dataset)):
-        if table is not None:
-            found = _by_frame(dataset, table)
-            if found:
-                return _priors(table.source, found, table.epsg, in_degrees=table.in_degrees)
+    table, _ = _of_table(dataset)
+    for one in (table, _of_metashape(dataset)):
+        if one is not None and (found := _by_frame(dataset, one)):
+            return _priors(one.source, found, one.epsg, in_degrees=one.in_degrees)
     tags = {i: tag for i, f in enumerate(dataset.frames) if (tag := read_geotag(f.path, f.name)) is not None}
     return _priors("EXIF", tags, WGS84, in_degrees=True) if tags else None
 
 
 def position_notes(dataset: Dataset) -> tuple[str, ...]:
     """A note on how many photos a table beside them has positions for. Raises InputError ``positions_invalid``."""
-    table = _of_table(dataset)
-    if table is None:
-        return ()
-    count = len(_by_frame(dataset, table))
-    return (f"{table.source}: measured positions of {count} of {len(dataset)} photos",)
+    return _of_table(dataset)[1]
 
 
-def _of_table(dataset: Dataset) -> PositionTable | None:
-    file = position_file(dataset.root)
-    return None if file is None else read_position_table(file)
+def _of_table(dataset: Dataset) -> tuple[PositionTable | None, tuple[str, ...]]:
+    """The first table beside the photos that has positions of some, and notes on it and those before it.
+
+    Raises:
+        InputError: ``positions_invalid`` for one that names photos of the set and cannot be read.
+    """
+    notes: list[str] = []
+    for file in position_files(dataset.root):
+        try:
+            table = read_position_table(file)
+        except InputError as error:
+            if _names_photos(file, dataset):
+                raise
+            what = f"{error.where} {error.detail.removesuffix('.')}"
+            notes.append(f"{what}; it names no photo of the set and is not used")
+            continue
+        count = len(_by_frame(dataset, table))
+        notes += [f"{table.source}: measured positions of {count} of {len(dataset)} photos", *table.notes]
+        if count:
+            return table, tuple(notes)
+    return None, tuple(notes)
+
+
+def _names_photos(file: Path, dataset: Dataset) -> bool:
+    """Whether a cell of the table is the name of a photo, with its extension or more than a number."""
+    try:
+        cells = set(re.split(r"[,;\t\s\"]+", read_text(file).casefold()))
+    except InputError:
+        return False
+    names = [frame.path for frame in dataset.frames]
+    return any(
+        path.name.casefold() in cells or (not path.stem.isdecimal() and path.stem.casefold() in cells)
+        for path in names
+    )
 
 
 def _of_metashape(dataset: Dataset) -> PositionTable | None:

@@ -17,8 +17,12 @@ from biresnerf.errors import InputError
 POSITION_FILES = ("positions.csv", "gps.csv", "geotags.csv", "reference.csv", "reference.txt", "geo.txt")
 WGS84 = 4979  # EPSG's number of latitude, longitude and ellipsoidal height
 EPSG = r'AUTHORITY\["EPSG",\s*"(\d+)"\]'  # in the text form of a frame, the last one is its own
-_DEGREES = frozenset({4326, WGS84})
+# Geographic frames whose numbers people write most: WGS 84, ETRS89, NAD83. Others are told by what they hold.
+_DEGREES = frozenset({4326, WGS84, 4258, 4269})
+_PROJECTED = (range(2000, 4000), range(20000, 33000))
+_METRES = {"m": 1.0, "km": 1000.0, "ft": 0.3048, "us-ft": 1200 / 3937}
 _HINT = "Write a header line: name,lat,lon,alt[,accuracy] in degrees and metres, or name,x,y,z[,accuracy] in metres."
+_GEO_HINT = "Begin with EPSG:4326, then a photo a line: name longitude latitude height, between spaces."
 _COLUMNS = {
     "name": ("name", "label", "image", "imagename", "filename", "file", "photo"),
     "lat": ("lat", "latitude"),
@@ -40,18 +44,25 @@ class PositionTable:
         places: by the photos' names as the source writes them.
         in_degrees: places are latitude, longitude and height.
         epsg: the frame's number, where it is known.
+        notes: for the user.
     """
 
     source: str
     places: dict[str, MeasuredPlace]
     in_degrees: bool
     epsg: int | None
+    notes: tuple[str, ...] = ()
 
 
-def position_file(root: Path) -> Path | None:
-    """The table of positions in the folder ``root``, if it has one."""
+def position_files(root: Path) -> list[Path]:
+    """The files in the folder ``root`` that are called as tables of positions, the preferred one first."""
     files = {path.name.lower(): path for path in sorted(root.iterdir()) if path.is_file()}
-    return next((files[name] for name in POSITION_FILES if name in files), None)
+    return [files[name] for name in POSITION_FILES if name in files]
+
+
+def is_geographic(frame: str) -> bool:
+    """Whether the text form (WKT) of a frame is one of degrees, alone or with a height system."""
+    return "GEOG" in frame and not re.search("PROJC|LOCAL_|ENGCRS|GEOCCS", frame)
 
 
 def read_position_table(file: Path) -> PositionTable:
@@ -61,11 +72,12 @@ def read_position_table(file: Path) -> PositionTable:
         InputError: ``positions_invalid``, with the line.
     """
     lines = read_text(file).splitlines()
-    if lines and (found := re.fullmatch(r"\s*EPSG:(\d{4,6})\s*", lines[0], re.I)):
-        return _geo_txt(file.name, lines, int(found[1]))
+    if lines and re.match(r"\s*(EPSG:|WGS84 UTM|'?\+proj)", lines[0], re.I):
+        return _geo_txt(file.name, lines)
     said = next((line for line in lines if "coordinatesystem" in line.lower().replace(" ", "")), "")
     header, rows = _header_and_rows(file.name, lines)
-    degrees = "lat" in header or ("xlongitude" in _plain(lines) and not re.search("LOCAL|PROJCS", said, re.I))
+    longitudes = "xlongitude" in _plain(lines)
+    degrees = "lat" in header or (longitudes and (not said.partition(":")[2] or is_geographic(said)))
     order = ("lat", "lon", "z") if "lat" in header else ("y", "x", "z") if degrees else ("x", "y", "z")
     missing = [name for name in ("name", *order) if name not in header]
     if missing:
@@ -84,20 +96,67 @@ def read_position_table(file: Path) -> PositionTable:
     return PositionTable(file.name, places, degrees, epsg)
 
 
-def _geo_txt(source: str, lines: Sequence[str], epsg: int) -> PositionTable:
-    """Name, x (or longitude), y (or latitude), height, and perhaps angles and accuracies, between spaces."""
-    degrees, places = epsg in _DEGREES, dict[str, MeasuredPlace]()
+def _geo_txt(source: str, lines: Sequence[str]) -> PositionTable:
+    """OpenDroneMap's: a frame, then names, x (or longitude), y (or latitude), perhaps height, angles and accuracies."""
+    rows: dict[int, list[str]] = {}
+    flat: list[int] = []
     for number, line in enumerate(lines[1:], 2):
         cells = line.split()
         if not cells or cells[0].startswith("#"):
             continue
+        if len(cells) < 3:
+            raise _invalid(f"{source} line {number}", "has less than a name and two numbers.")
+        if len(cells) == 3:
+            flat.append(number)
+        else:
+            rows[number] = cells
+    degrees, metres, epsg = _frame_of(lines[0], list(rows.values()), f"{source} line 1")
+    places: dict[str, MeasuredPlace] = {}
+    for number, cells in rows.items():
         where = f"{source} line {number}"
-        if len(cells) < 4:
-            raise _invalid(where, "has less than a name and three numbers.")
         x, y, z = cells[1:4]
         texts = [y, x, z] if degrees else [x, y, z]
         _add(places, cells[0], texts, _cell(cells, _ODM_ACCURACY), where, degrees=degrees)
-    return PositionTable(source, places, degrees, WGS84 if degrees else epsg)
+        (a, b, c), accuracy = places[cells[0]]
+        places[cells[0]] = MeasuredPlace((a * metres, b * metres, c), accuracy)
+    notes = ()
+    if flat:
+        notes = (f"{source} line {flat[0]} has no height: {len(flat)} positions without one are not used",)
+    return PositionTable(source, places, degrees, epsg, notes)
+
+
+def _frame_of(header: str, rows: Sequence[Sequence[str]], where: str) -> tuple[bool, float, int | None]:
+    """Whether the first line of a geo.txt names a frame of degrees, else its metres per unit, and EPSG's number.
+
+    It is ``EPSG:n``, ``WGS84 UTM 32N`` or a string of PROJ. Of the geographic ones among EPSG's numbers few are known
+    here: others are those whose coordinates are all small, as nobody takes photos at a projection's origin.
+    """
+    if found := re.fullmatch(r"\s*EPSG:(\d{4,6})\s*", header, re.I):
+        number = int(found[1])
+        if number in _DEGREES:
+            return True, 1.0, WGS84 if number == 4326 else number
+        small = all(abs(value) <= 180 for cells in rows for value in map(_number, cells[1:3]))
+        return small and not any(number in some for some in _PROJECTED), 1.0, number
+    if found := re.fullmatch(r"\s*WGS84 UTM (\d{1,2})([NS])\s*", header, re.I):
+        return False, 1.0, int(found[1]) + (32700 if found[2] in "Ss" else 32600)
+    words = header.strip().strip("'").split()
+    terms = {key: value for key, _, value in (word.removeprefix("+").partition("=") for word in words)}
+    world = "WGS84" in (terms.get("datum"), terms.get("ellps"))
+    if terms.get("proj") in ("longlat", "latlong", "lonlat", "latlon"):
+        return True, 1.0, WGS84 if world else None
+    try:
+        metres = float(terms["to_meter"]) if "to_meter" in terms else _METRES[terms.get("units", "m")]
+        zone = int(terms["zone"]) if terms["proj"] == "utm" else 0
+    except (KeyError, ValueError):
+        raise _invalid(where, f"names no frame that is known: {header.strip()[:100]!r}.") from None
+    return False, metres, zone + (32700 if "south" in terms else 32600) if zone and world else None
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return 0.0
 
 
 def _header_and_rows(
@@ -155,4 +214,5 @@ def _add(
 
 
 def _invalid(where: str, detail: str) -> InputError:
-    return InputError("positions_invalid", detail, where=where, hint=_HINT)
+    hint = _GEO_HINT if where.lower().startswith("geo.txt") else _HINT
+    return InputError("positions_invalid", detail, where=where, hint=hint)
