@@ -21,6 +21,8 @@ if not CASES.is_dir():
 READ = {
     "30_unpadded_numbers/kitti": (12, 12, "as numbers (frame_2.jpg before frame_10.jpg)"),
     "30_unpadded_numbers/log": (12, 12, "as numbers (2.jpg before 10.jpg)"),
+    "34_times_of_photos/ns_names": (12, 10, "by time (by the images' names"),
+    "34_times_of_photos/prefixed": (12, 10, "by time (by the images' names"),
     "35_geo_txt/epsg_4258": (8, 8, "measured positions of 8 of 8"),
     "35_geo_txt/no_height": (8, 8, "geo.txt line 2 has no height"),
     "35_geo_txt/proj_header": (8, 8, "measured positions of 8 of 8"),

@@ -119,7 +119,7 @@ def _geo_txt(source: str, lines: Sequence[str]) -> PositionTable:
         _add(places, cells[0], texts, _cell(cells, _ODM_ACCURACY), where, degrees=degrees)
         (a, b, c), accuracy = places[cells[0]]
         places[cells[0]] = MeasuredPlace((a * metres, b * metres, c), accuracy)
-    notes = ()
+    notes: tuple[str, ...] = ()
     if flat:
         notes = (f"{source} line {flat[0]} has no height: {len(flat)} positions without one are not used",)
     return PositionTable(source, places, degrees, epsg, notes)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
@@ -28,10 +29,27 @@ def times_of_images(names: Sequence[str], root: Path) -> tuple[dict[str, float],
                     times[name] = time
         return times, "by rgb.txt"
     for name in names:
-        number = number_of(PurePosixPath(name).stem)
+        number = time_in(PurePosixPath(name).stem)
         if number is not None:
             times[name] = number
     return times, "by the images' names"
+
+
+def time_in(stem: str) -> float | None:
+    """The time in a photo's name: the number with most digits, behind a prefix or before more words.
+
+    ROS writes seconds and nanoseconds apart (1403636580_013555584).
+    """
+    stem = re.sub(r"(?<!\d)(\d{10})[_-](?=\d{6,9}(?!\d))", r"\1.", stem)
+    return number_of(max(re.findall(r"\d+(?:\.\d+)?", stem), key=len, default=""))
+
+
+def in_seconds(time: float) -> float:
+    """A time since 1970 in seconds, whether given in these, ms, us or ns; other numbers as they are."""
+    for least, unit in ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3)):
+        if least <= time < 1e4 * least:
+            return time * unit
+    return time
 
 
 def number_of(word: str) -> float | None:
@@ -44,7 +62,19 @@ def number_of(word: str) -> float | None:
 
 
 def nearest_poses(taken: dict[str, float], times: Sequence[float]) -> dict[str, int]:
-    """The pose nearest in time to each image, where one is near enough; each pose for the image nearest to it."""
+    """The pose nearest in time to each image, where one is near enough; each pose for the image nearest to it.
+
+    Times may be in s, ms, us or ns: those since 1970 show it by their size, others are tried in each.
+    """
+    times = [in_seconds(time) for time in times]
+    tried = [
+        _nearest({name: in_seconds(time) * unit for name, time in taken.items()}, times)
+        for unit in (1.0, 1e-3, 1e-6, 1e-9)
+    ]
+    return max(tried, key=len)
+
+
+def _nearest(taken: dict[str, float], times: Sequence[float]) -> dict[str, int]:
     order = np.argsort(times)
     ordered = np.array(times)[order]
     best: dict[int, tuple[float, str]] = {}

@@ -71,6 +71,7 @@ KITTI = Format(
 )
 
 _PHOTO_FOLDERS = ("image_2", "image_0", "image_3", "image_1")  # KITTI's: the colour cameras first
+_LEAST_CLOCK = 1e8  # s; smaller whole numbers in names count photos, as a rule
 _HEAD = "# timestamp tx ty tz qx qy qz qw: camera to world, OpenCV axes (x right, y down, z forward), the input's frame"
 
 
@@ -143,8 +144,11 @@ def matched(trajectory: Trajectory, names: Sequence[str], root: Path) -> tuple[d
         taken, by = times_of_images(names, root)
         nearest = nearest_poses(taken, times)
         numbers = all(time == math.floor(time) and 0 <= time < len(names) for time in times)
-        # Whole numbers may be names, or count from 0 what names count from 1: then not all of them meet.
-        if len(nearest) >= (count if numbers else min(count, len(names)) / 2):
+        counted = all(time == math.floor(time) < _LEAST_CLOCK for time in taken.values())
+        # Whole numbers may be names, or count from 0 what names count from 1: then not all of them meet. Numbers that
+        # count photos meet a few times by chance.
+        share = 1.0 if numbers else 0.9 if counted else 0.5
+        if taken and len(nearest) >= share * (count if numbers else min(count, len(names))):
             return nearest, f"by time ({by}, at most {MAX_TIME_APART_S} s apart)"
         if numbers:
             by_number = {names[int(time)]: i for i, time in enumerate(times)}
@@ -157,7 +161,8 @@ def matched(trajectory: Trajectory, names: Sequence[str], root: Path) -> tuple[d
         "pose_count_mismatch",
         f"has {count} poses for {len(names)} images, and does not say which belongs to which.",
         where=trajectory.file.name,
-        hint="Name images by their time, add rgb.txt (time and name a line), or give one pose an image.",
+        hint="Name images by their time (s, ms, us or ns, on the poses' clock), add rgb.txt (time and name a line), or "
+        "give one pose an image.",
     )
 
 

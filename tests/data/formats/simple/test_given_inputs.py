@@ -70,6 +70,41 @@ def test_a_tum_trajectory_is_matched_by_time_or_number_or_order_and_says_how(tmp
     assert refined_set(dataset, dataset.world_from_cam).timestamps_s == tuple(map(float, times))
 
 
+EUROC_NS = [1403636579763555584 + 50_000_000 * index for index in range(4)]
+
+
+@pytest.mark.parametrize(
+    ("times", "names"),
+    [
+        (TIMES, [f"rgb_{time}.png" for time in TIMES]),
+        (TIMES, [f"cam0_{time}_left.png" for time in TIMES]),
+        ([f"{ns / 1e9:.9f}" for ns in EUROC_NS], [f"{ns}.png" for ns in EUROC_NS]),
+        ([f"{ns / 1e9:.9f}" for ns in EUROC_NS], [f"{ns // 1000}.png" for ns in EUROC_NS]),
+        ([f"{ns / 1e9:.9f}" for ns in EUROC_NS], [f"{ns // 10**6}.png" for ns in EUROC_NS]),
+        ([f"{ns / 1e9:.9f}" for ns in EUROC_NS], [f"{ns // 10**9}_{ns % 10**9:09}.png" for ns in EUROC_NS]),
+        ([f"{ns}.000000" for ns in EUROC_NS], [f"frame-{ns}.png" for ns in EUROC_NS]),
+        ([f"{ns}" for ns in EUROC_NS], [f"{ns / 1e9:.6f}.png" for ns in EUROC_NS]),
+        (["12.345", "12.445", "12.545", "12.645"], ["12346.png", "12446.png", "12546.png", "12646.png"]),
+    ],
+)
+def test_times_in_names_are_matched_in_any_unit_and_behind_any_prefix(tmp_path, times, names):
+    # One photo more than there are poses: order decides nothing.
+    trajectories.tum_set(tmp_path, list(times), tuple(names))
+    write_image(tmp_path / "images/zz_without_time.png", 9)
+    dataset = read_dataset(tmp_path)
+    assert dataset.posed.tolist() == [True, True, True, True, False]
+    np.testing.assert_allclose([f.world_from_cam for f in dataset.frames[:4]], truth(), atol=1e-12)
+    assert "by time (by the images' names" in dataset.warnings[0]
+
+
+def test_numbers_that_count_photos_are_no_times(tmp_path):
+    names = tuple(f"frame_{number}.png" for number in range(4))
+    trajectories.tum_set(tmp_path, ["0.0", "0.5", "1.0", "1.5"], names)
+    dataset = read_dataset(tmp_path)
+    assert_at_truth(dataset)
+    assert "in the order of the images' names" in dataset.warnings[0]
+
+
 def test_a_trajectorys_own_comments_and_rgb_txt_go_before_the_order(tmp_path):
     names = tuple(reversed(NAMES))
     head = "".join(f"# {time} {name}\n" for time, name in zip(TIMES, names, strict=True))
