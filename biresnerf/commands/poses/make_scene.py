@@ -24,6 +24,8 @@ KINDS = {
     "turntable": "the same vase turned once before the camera, in uneven steps; without poses, those of --of too",
 }
 _FOCAL_TOO_LONG = 1.01
+CAMERAS = ("none", "iphone", "iphone-upright", "android", "reflex", "drone")
+_CAMERA_OF_KIND = {"phone": "iphone", "half": "iphone"}
 
 
 @dataclass(frozen=True)
@@ -61,17 +63,23 @@ class MadeScene:
     "are uneven.",
 )  # fmt: skip
 @click.option(
+    "--camera", type=click.Choice(CAMERAS),
+    help="Who takes the photos that are rendered: JPEG files with all the EXIF of such a camera, turned if held "
+    "upright; none: PNG without any. [default: iphone for phone and half, else none]",
+)  # fmt: skip
+@click.option(
     "--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Seed of scene and noise."
 )
 @json_option
 def make_scene_command(
-    output: Path, kind: str, own: Path | None, views: int, size: int, noise: float, seed: int, as_json: bool
-) -> None:
+    output: Path, kind: str, own: Path | None, views: int, size: int, noise: float, camera: str | None, seed: int,
+    as_json: bool,
+) -> None:  # fmt: skip
     """Make a scene with wrong or missing poses, and a file with the true ones.
 
     The scene is written to OUTPUT, the true poses to OUTPUT.truth.json; `biresnerf evaluate` compares a result with it.
     """
-    made = make_scene(output, kind, own=own, views=views, size=size, noise=noise, seed=seed)
+    made = make_scene(output, kind, own=own, views=views, size=size, noise=noise, camera=camera, seed=seed)
     document = {**asdict(made), "folder": str(made.folder), "truth": str(made.truth)}
     show(document, str(made), as_json=as_json)
 
@@ -84,6 +92,7 @@ def make_scene(
     views: int = 60,
     size: int = 100,
     noise: float = 0.15,
+    camera: str | None = None,
     seed: int = 0,
 ) -> MadeScene:
     """Writes a set of a kind of `KINDS` to `output`, and its true poses to OUTPUT.truth.json.
@@ -93,6 +102,7 @@ def make_scene(
         size: width of the images (px), of those rendered.
         noise: standard deviation of the poses' noise, as BARF has it, of the kinds that are turned at random; the share
             by which a turntable's steps are uneven.
+        camera: one of `CAMERAS`, of those rendered; None: as usual for the kind.
 
     Raises:
         InputError: `output` is not empty, or `own` cannot be read or lacks poses.
@@ -100,7 +110,8 @@ def make_scene(
     require_empty(output)
     from biresnerf.data.formats.transforms.read_transforms import read_transforms
 
-    path = _copied(own, output) if own else _made(output, kind, views, size, noise, seed)
+    camera = camera or _CAMERA_OF_KIND.get(kind, "none")
+    path = _copied(own, output) if own else _made(output, kind, views, size, noise, camera, seed)
     truth = output.with_name(f"{output.name}.truth.json")
     shutil.copyfile(path, truth)
     dataset = read_transforms(path)
@@ -113,15 +124,16 @@ def make_scene(
     return MadeScene(output, len(dataset), len(dataset), truth)
 
 
-def _made(output: Path, kind: str, views: int, size: int, noise: float, seed: int) -> Path:
+def _made(output: Path, kind: str, views: int, size: int, noise: float, camera: str, seed: int) -> Path:
     """A rendered set with true poses; its transforms.json."""
+    from biresnerf.data.synthetic.camera_photos import MAKERS
     from biresnerf.data.synthetic.captures import write_turntable, write_vase, write_walk
     from biresnerf.data.synthetic.scene import write_synthetic_scene
 
     if kind == "turntable":
-        return write_turntable(output, views, size, seed, noise)
+        return write_turntable(output, views, size, seed, noise, MAKERS.get(camera))
     write = {"dome": write_synthetic_scene, "vase": write_vase}.get(kind, write_walk)
-    return write(output, views, size, seed)
+    return write(output, views, size, seed, MAKERS.get(camera))
 
 
 def _copied(own: Path, output: Path) -> Path:
@@ -156,6 +168,7 @@ def _perturb_file(dataset: Dataset, path: Path, kind: str, noise: float, seed: i
 
     from biresnerf.data.formats.transforms.write_transforms import write_transforms
     from biresnerf.data.model.image_order import natural_order
+    from biresnerf.data.photos.orientation import shown_from_cam
     from biresnerf.geometry.perturb import drift_like_a_phone, perturb_poses
 
     true = dataset.world_from_cam
@@ -163,8 +176,10 @@ def _perturb_file(dataset: Dataset, path: Path, kind: str, noise: float, seed: i
         write_transforms(dataset, perturb_poses(true, noise, seed), path)
         return
     order = natural_order(dataset.file_names)
+    # Gravity is where photos say it is, however the phone was held.
+    shown = shown_from_cam(dataset.frames)[order]
     drifted = true.copy()
-    drifted[order] = drift_like_a_phone(true[order], seed)
+    drifted[order] = drift_like_a_phone(true[order] @ shown.swapaxes(1, 2), seed) @ shown
     write_transforms(dataset, drifted, path)
     document = json.loads(path.read_text("utf-8"))
     for part in (document, *document["frames"]):

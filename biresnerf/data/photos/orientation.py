@@ -12,12 +12,15 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.photos.image_files import FocalPlane, ImageHeader
+from biresnerf.data.model.dataset import Frame
+from biresnerf.data.photos.image_files import FocalPlane, ImageHeader, read_header
 from biresnerf.data.photos.photo_folders import few_names
 
 T = TypeVar("T", bound=np.generic)
 # The orientation that undoes another.
 INVERSE = {1: 1, 2: 2, 3: 3, 4: 4, 5: 5, 6: 8, 7: 7, 8: 6}
+# Quarter turns, clockwise, that set stored pixels upright, apart from those that are mirrored too.
+_QUARTERS = {1: 0, 2: 0, 3: 2, 4: 2, 5: 1, 6: 1, 7: 3, 8: 3}
 
 
 def turned_size(width: int, height: int, orientation: int) -> tuple[int, int]:
@@ -34,6 +37,18 @@ def turned(picture: NDArray[T], orientation: int) -> NDArray[T]:
     if orientation in (2, 3, 6, 7):
         picture = picture[:, ::-1]
     return np.ascontiguousarray(picture)
+
+
+def shown_from_stored(orientation: int) -> NDArray[np.float64]:
+    """Motion [4, 4] from the camera of the stored pixels to the upright one; mirroring is left out."""
+    quarter = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    return np.linalg.matrix_power(quarter, _QUARTERS[orientation])
+
+
+def shown_from_cam(frames: Sequence[Frame]) -> NDArray[np.float64]:
+    """Motions [n, 4, 4] from each frame's camera to that of its photo as viewers show it."""
+    turns = [f.orientation == 1 and read_header(f.path, f.name).orientation for f in frames]
+    return np.stack([shown_from_stored(turn or 1) for turn in turns])
 
 
 def turned_header(header: ImageHeader, orientation: int) -> ImageHeader:

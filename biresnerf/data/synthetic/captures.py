@@ -10,6 +10,8 @@ from PIL import Image
 
 from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.conventions import file_from_world_from_cam
+from biresnerf.data.photos.orientation import turned_size
+from biresnerf.data.synthetic.camera_photos import Maker, stored_poses, turn_of, write_camera_photo
 from biresnerf.data.synthetic.scene import (
     CAMERA_DISTANCE,
     MADE_SCENE,
@@ -80,8 +82,13 @@ def table_textures(seed: int) -> list[Texture]:
     return random_textures(len(SHAPES), seed) + around
 
 
-def write_walk(folder: Path, n_views: int, width: int, seed: int) -> Path:
+def write_walk(folder: Path, n_views: int, width: int, seed: int, maker: Maker | None = None) -> Path:
     """Writes photos of a walk around the table and transforms.json as NeRFCapture does, with true poses, in metres.
+
+    Args:
+        width: of the pixels as stored, px; the photos are 4 to 3.
+        maker: whose camera is carried, on its side for photos that its EXIF turns; None: PNG, level. Poses and lens are
+            those of the stored pixels.
 
     Returns:
         the path of transforms.json.
@@ -91,9 +98,14 @@ def write_walk(folder: Path, n_views: int, width: int, seed: int) -> Path:
     textures = table_textures(seed)
     (folder / "images").mkdir(parents=True, exist_ok=True)
     for index, pose in enumerate(poses):
-        pixels = render_shapes(TABLE_SCENE, textures, pose, width, height, focal)[0]
-        Image.fromarray(pixels[..., :3].copy()).save(folder / "images" / f"{index}.png", compress_level=3)
-    in_metres = PHONE_FROM_SCENE @ poses
+        size = turned_size(width, height, turn_of(maker, index))
+        pixels = render_shapes(TABLE_SCENE, textures, pose, *size, focal)[0][..., :3].copy()
+        path = folder / "images" / f"{index}.png"
+        if maker is None:
+            Image.fromarray(pixels).save(path, compress_level=3)
+        else:
+            write_camera_photo(path.with_suffix(".jpg"), pixels, maker, index, focal, pose)
+    in_metres = PHONE_FROM_SCENE @ stored_poses(poses, maker)
     in_metres[:, :3, 3] *= TABLE_METRES
     lens = {
         "fl_x": focal,
@@ -112,9 +124,9 @@ def write_walk(folder: Path, n_views: int, width: int, seed: int) -> Path:
     return path
 
 
-def write_vase(folder: Path, n_views: int, size: int, seed: int) -> Path:
+def write_vase(folder: Path, n_views: int, size: int, seed: int, maker: Maker | None = None) -> Path:
     """Writes square cut-out views of the vase and transforms.json (Blender dialect, true poses); returns its path."""
-    return _write_vase(folder, synthetic_cameras(n_views, seed), size, seed)
+    return _write_vase(folder, synthetic_cameras(n_views, seed), size, seed, maker)
 
 
 def turntable_cameras(n_views: int, uneven: float, seed: int) -> NDArray[np.float64]:
@@ -130,17 +142,18 @@ def turntable_cameras(n_views: int, uneven: float, seed: int) -> NDArray[np.floa
     return poses
 
 
-def write_turntable(folder: Path, n_views: int, size: int, seed: int, uneven: float) -> Path:
+def write_turntable(
+    folder: Path, n_views: int, size: int, seed: int, uneven: float, maker: Maker | None = None
+) -> Path:
     """Writes square cut-out views of the vase on a turntable and transforms.json as `write_vase` does."""
-    return _write_vase(folder, turntable_cameras(n_views, uneven, seed), size, seed)
+    return _write_vase(folder, turntable_cameras(n_views, uneven, seed), size, seed, maker)
 
 
-def _write_vase(folder: Path, poses: NDArray[np.float64], size: int, seed: int) -> Path:
+def _write_vase(folder: Path, poses: NDArray[np.float64], size: int, seed: int, maker: Maker | None) -> Path:
     textures = [
         Texture.glaze(np.random.default_rng([seed, 5, index]), base, _GLAZE_CONTRAST)
         for index, base in enumerate(_GLAZE)
     ]
     focal = synthetic_focal(size)
-    return write_blender_set(
-        folder, poses, (render_shapes(VASE, textures, pose, size, size, focal)[0] for pose in poses), "vase"
-    )
+    pictures = (render_shapes(VASE, textures, pose, size, size, focal)[0] for pose in poses)
+    return write_blender_set(folder, poses, pictures, "vase", maker)

@@ -11,6 +11,7 @@ from PIL import Image
 
 from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.conventions import file_from_world_from_cam
+from biresnerf.data.synthetic.camera_photos import Maker, stored_poses, write_camera_photo
 from biresnerf.data.synthetic.shapes import Shape, Texture
 
 CAMERA_DISTANCE = 4.0  # like the NeRF-synthetic sets, as is the angle of view
@@ -139,30 +140,44 @@ def _rays_that_may_hit(
     return np.flatnonzero(directions @ to_centre >= cosine * distance - 1e-4)
 
 
-def write_synthetic_scene(folder: Path, n_views: int, size: int, seed: int) -> Path:
+def write_synthetic_scene(
+    folder: Path, n_views: int, size: int, seed: int, maker: Maker | None = None
+) -> Path:
     """Writes ``n_views`` square images of ``size`` px and transforms.json (Blender dialect, true poses).
 
     Returns:
         the path of transforms.json, written last.
     """
     poses = synthetic_cameras(n_views, seed)
-    return write_blender_set(folder, poses, (render_synthetic(pose, size, seed)[0] for pose in poses), "dome")
+    pictures = (render_synthetic(pose, size, seed)[0] for pose in poses)
+    return write_blender_set(folder, poses, pictures, "dome", maker)
 
 
 def write_blender_set(
-    folder: Path, poses: NDArray[np.float64], pictures: Iterable[NDArray[np.uint8]], made: str
+    folder: Path,
+    poses: NDArray[np.float64],
+    pictures: Iterable[NDArray[np.uint8]],
+    made: str,
+    maker: Maker | None = None,
 ) -> Path:
     """Writes the picture of each pose [n, 4, 4] to train/, then transforms.json (Blender dialect); returns its path.
 
     Args:
         made: the shapes' name, for `true_depth`.
+        maker: whose cameras take the pictures before a white wall; None: cut out, as PNG. Poses are written for pixels
+            as stored.
     """
     (folder / "train").mkdir(parents=True, exist_ok=True)
     for index, picture in enumerate(pictures):
-        Image.fromarray(picture).save(folder / "train" / f"r_{index}.png", compress_level=3)
+        path = folder / "train" / f"r_{index}.png"
+        if maker is None:
+            Image.fromarray(picture).save(path, compress_level=3)
+        else:
+            focal = synthetic_focal(len(picture))
+            write_camera_photo(path.with_suffix(".jpg"), picture, maker, index, focal, poses[index])
     frames = [
         {"file_path": f"./train/r_{index}", "transform_matrix": matrix.tolist()}
-        for index, matrix in enumerate(file_from_world_from_cam(poses, np.eye(4), 1.0))
+        for index, matrix in enumerate(file_from_world_from_cam(stored_poses(poses, maker), np.eye(4), 1.0))
     ]
     path = folder / "transforms.json"
     write_json(path, {"camera_angle_x": CAMERA_ANGLE_X, MADE_SCENE: made, "frames": frames}, indent=1)

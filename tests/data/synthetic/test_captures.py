@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from biresnerf.commands.poses.make_scene import KINDS, make_scene_command
+from biresnerf.commands.poses.make_scene import CAMERAS, KINDS, make_scene_command
 from biresnerf.data.formats.read_dataset import read_dataset, read_poses
+from biresnerf.data.photos.orientation import shown_from_cam
+from biresnerf.data.synthetic.camera_photos import MAKERS
 from biresnerf.data.synthetic.captures import TABLE_SCENE, VASE, table_textures, walking_cameras
 from biresnerf.data.synthetic.scene import random_textures, render_shapes, synthetic_cameras, synthetic_focal
 from biresnerf.errors import InputError
@@ -94,6 +96,20 @@ def test_the_phones_file_is_as_apps_write_it_and_its_truth_beside_it(tmp_path):
     up = -stacked(truth)[:, :3, 1].mean(axis=0)
     assert up[1] / np.linalg.norm(up) > 0.95  # y is up
     assert len(read_dataset(tmp_path / "phone")) == 8
+
+
+def test_every_maker_can_be_asked_for():
+    assert ("none", *MAKERS) == CAMERAS
+
+
+@pytest.mark.parametrize("camera", ["iphone-upright", "android"])
+def test_poses_drift_alike_however_the_phone_is_held(tmp_path, camera):
+    poses = {}
+    for name in ("none", camera):
+        make(tmp_path / name, "--kind", "phone", "--camera", name)
+        dataset = read_dataset(tmp_path / name)
+        poses[name] = dataset.world_from_cam @ np.linalg.inv(shown_from_cam(dataset.frames))
+    np.testing.assert_allclose(poses[camera], poses["none"], atol=1e-9)
 
 
 def test_half_of_the_walk_is_in_the_model_and_all_of_it_in_the_folder(tmp_path):
