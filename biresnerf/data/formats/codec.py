@@ -66,6 +66,8 @@ class Codec:
         pose_place: for a file that the user names, the file or folder to be read; None where it is not of this format
             by its name.
         image_root: the folder that the images of such a place lie in or below.
+        loose: whether other programs use its names and suffixes, too: it is not looked for in folders below, and a
+            format that recognises a file goes first.
         count: how many images such a place has, for a format of which a set may hold several places, each with its
             photos beside: the one with most images is read.
         write: None for formats that are only read.
@@ -78,6 +80,7 @@ class Codec:
     recognises: Callable[[Path], bool] = Path.is_file
     pose_place: Callable[[Path], Path | None] | None = None
     image_root: Callable[[Path], Path] = lambda place: place.parent
+    loose: bool = False
     count: Callable[[Path], int] | None = None
     write: Writer | None = None
     given_back: Callable[[Dataset], bool] = lambda dataset: False

@@ -31,8 +31,6 @@ _NAMED_IN_SETS = (IMAGE_FOLDER, VIDEO_FRAMES)
 _DEPTH = 4  # of folders in which poses of a set are looked for: dslr/colmap/, dense/0/sparse/
 _MOST_FOLDERS = 2_000
 _RESULT = {"report.json", "config.json"}  # what a result of ours holds
-# Formats known by names that many programs use: looked for where the user points, not in all folders below.
-_LOOSE = ("trajectory",)
 
 
 @dataclass(frozen=True)
@@ -129,7 +127,7 @@ def look_at(file: Path, within: Path | None = None) -> FolderContents:
             return 3
         if file.name in codec.format.found_as or place != file:
             return 0
-        return 2 if codec.recognises is Path.is_file else 1
+        return 2 if codec.loose or codec.recognises is Path.is_file else 1
 
     # A name that a format declares goes before what a file begins with, and that before a suffix, which several share.
     for name, codec in sorted(readable, key=doubt):
@@ -182,16 +180,21 @@ def _found(root: Path) -> list[_Found]:
     if here and (ALL_CODECS[here[0].format].count is None or images_beside(here[0].root)):
         return here
     below = [
-        one for folder in _folders_below(root) for one in _pose_places(folder) if one.format not in _LOOSE
+        one
+        for folder in _folders_below(root)
+        for one in _pose_places(folder)
+        if not ALL_CODECS[one.format].loose
     ]
-    wanted = [one for one in below if one.format == (here or below)[0].format] if here or below else []
-    count = ALL_CODECS[wanted[0].format].count if wanted else None
     if here:
-        return [*(one for one in wanted if images_beside(one.root)), *here]
-    if count is not None:
-        best = max(wanted, key=lambda one: (bool(images_beside(one.root)), count(one.place)))
-        below.sort(key=lambda one: one != best)
-    return below
+        return [*(one for one in below if one.format == here[0].format and images_beside(one.root)), *here]
+    return sorted(below, key=_from_set)
+
+
+def _from_set(one: _Found) -> tuple[bool, int, int, int]:
+    """Sorts poses with photos beside them (not those of a camera's path) first, then the nearest, then the largest."""
+    photos, codec = len(all_photos(one.root)), ALL_CODECS[one.format]
+    images = photos if codec.count is None else codec.count(one.place)
+    return not photos, len(one.root.parts), codec.format.rank, -images
 
 
 def _folders_below(root: Path) -> list[Path]:

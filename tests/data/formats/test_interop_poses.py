@@ -23,7 +23,13 @@ SETS = {
     "24_colmap_model_elsewhere/dslr_colmap": ("colmap", 8, 116.9192, None),
     "25_colmap_photos_in_another_folder/images_4": ("colmap", 8, 116.9192, None),
     "25_colmap_photos_in_another_folder/root_model": ("colmap", 8, 116.9192, "dense/sparse was read"),
+    "26_3d_scanner_app/chair": ("3d-scanner-app", 6, None, None),
+    "27_nerfpp/scene": ("matrix-files", 8, 116.9192, "train/pose was read"),
+    "27_nerfpp/train_alone": ("matrix-files", 8, 116.9192, None),
+    "29_other_poses_ignored/realestate10k": ("realestate10k", 8, 116.9192, None),
     "41_photos_in_sibling_folder/dslr": ("nerfstudio", 8, 116.9192, "nerfstudio2/transforms.json was not"),
+    "42_polycam_without_size/capture": ("polycam", 8, 116.9192, None),
+    "43_metashape_rig/set": ("metashape", 12, 116.9192, None),
     "44_largest_model_is_1/set": ("colmap", 12, 116.9192, "sparse/1 (12 images) was read"),
 }
 

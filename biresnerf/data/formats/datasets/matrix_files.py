@@ -1,8 +1,9 @@
-"""A 4 x 4 matrix per image in a file of its own: ScanNet, NSVF, 7-Scenes, 3DMatch, MobileBrick.
+"""A 4 x 4 matrix per image in a file of its own: ScanNet, NSVF, NeRF++, 7-Scenes, 3DMatch, MobileBrick.
 
 Camera to world, OpenCV axes. Lenses stand in files beside: ``intrinsic/NAME.txt`` (MobileBrick, an ARKit capture),
+``intrinsics/NAME.txt`` (NeRF++; pixels from the corner: nerf_sample_ray_split.py of Kai-46/nerfplusplus),
 ``intrinsic/intrinsic_color.txt`` (ScanNet), ``intrinsics.txt`` (NSVF: a matrix, or f, cx, cy and 0 in the first line),
-``camera-intrinsics.txt`` (3DMatch). All these programs take a pixel's coordinates for its indices: load_intrinsics and
+``camera-intrinsics.txt`` (3DMatch). The others take a pixel's coordinates for its indices: load_intrinsics and
 get_uv in fairnr/data/data_utils.py of facebookresearch/NSVF, depth2xyz in utils/geometry.py of
 ActiveVisionLab/MobileBrick, the kernel of fusion.py in andyzeng/tsdf-fusion-python, which also shows 7-Scenes' axes.
 ScanNet's axes: nerfstudio's scannet_dataparser.py. A pose that was lost is infinite there.
@@ -28,7 +29,7 @@ from biresnerf.options.formats import Format
 
 MATRIX_FILES = Format(
     name="matrix-files",
-    title="a 4 × 4 per image (ScanNet, 7-Scenes, NSVF, 3DMatch, MobileBrick)",
+    title="a 4 × 4 per image (ScanNet, 7-Scenes, NSVF, NeRF++, 3DMatch, MobileBrick)",
     rank=83,
     found_as=("pose", "poses", "."),
     gives="poses; one lens, or one an image, from the intrinsics beside them",
@@ -38,6 +39,7 @@ _HINT = "Give a file of 4 rows of 4 numbers for each image, camera to world."
 _FOLDERS = ("pose", "poses")
 _FRAME = re.compile(r"(.*frame-\d+)\.pose\.txt$")  # 7-Scenes and 3DMatch, beside NAME.color.png
 _SHARED = ("intrinsic/intrinsic_color.txt", "intrinsics.txt", "camera-intrinsics.txt")
+_OWN = {"intrinsic": 0.0, "intrinsics": 0.5}  # folders, and where the first pixel's middle lies
 _HEAD_BYTES = 4096
 
 
@@ -55,8 +57,8 @@ def parse_matrix_files(_root: Path, place: Path) -> ParsedPoses:
         raise shared_lens
 
     def read(file: Path) -> Placed:
-        own = root / "intrinsic" / file.name
-        lens = _lens(own) if own.is_file() else shared_lens
+        own = next((path for name in _OWN if (path := root / name / file.name).is_file()), None)
+        lens = shared_lens if own is None else _lens(own)
         values = finite_numbers(read_text(file).split(), file.name, _HINT)
         if len(values) not in (12, 16):
             raise invalid_file(file.name, f"has {len(values)} numbers, not 16.", _HINT)
@@ -100,9 +102,9 @@ def _lens(file: Path) -> LensOf:
     lines = [line.split() for line in read_text(file).splitlines() if line.strip()]
     numbers = [len(line) for line in lines]
     matrix: NDArray[np.float64]
-    if numbers in ([4] * 4, [4] * 3, [3] * 3):
+    if numbers in ([4] * 4, [4] * 3, [3] * 3, [16], [12], [9]):
         words = [word for line in lines for word in line]
-        matrix = finite_numbers(words, file.name, _HINT).reshape(len(lines), -1)
+        matrix = finite_numbers(words, file.name, _HINT).reshape(-1, 3 if len(words) == 9 else 4)
     elif numbers and numbers[0] == 4:
         focal, cx, cy, _ = finite_numbers(lines[0], f"{file.name} first line", _HINT).tolist()
         matrix = np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
@@ -110,7 +112,7 @@ def _lens(file: Path) -> LensOf:
         raise invalid_file(
             file.name, "is no intrinsic matrix of 3 or 4 rows.", "Give fx 0 cx, 0 fy cy, 0 0 1."
         )
-    return at_size_of(pinhole_of(matrix, file.name, 0.0))
+    return at_size_of(pinhole_of(matrix, file.name, _OWN.get(file.parent.name, 0.0)))
 
 
 def _image_root(place: Path) -> Path:

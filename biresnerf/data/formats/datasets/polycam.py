@@ -2,7 +2,7 @@
 
 ``t_00`` to ``t_23`` are camera to world by rows with OpenGL axes, in ARKit's world (y up): nerfstudio's
 process_data/polycam_utils.py, which exchanges the world's axes; here they stay. Coordinates of pixels count from the
-corner there. Photos are in corrected_images (images) under the same names.
+corner there. Photos are in corrected_images (images) under the same names; newer files leave their size out.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pydantic import BaseModel
 
 from biresnerf.data.formats.codec import Codec, head_holds
 from biresnerf.data.formats.parsed_poses import ParsedPoses
-from biresnerf.data.formats.pose_rows import Placed, Row, lens_of, parsed_rows
+from biresnerf.data.formats.pose_rows import Placed, Row, at_size_of, lens_of, parsed_rows
 from biresnerf.data.model.conventions import OPENCV_FROM_OPENGL
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.untrusted_file import checked, invalid_file, read_json_object
@@ -39,8 +39,8 @@ class _Camera(BaseModel, allow_inf_nan=False):
     fy: float
     cx: float
     cy: float
-    width: int
-    height: int
+    width: int = 0
+    height: int = 0
 
 
 class _Matrix(BaseModel, allow_inf_nan=False):
@@ -70,7 +70,9 @@ def _read(file: Path) -> Placed:
     matrix = checked(_Matrix, {"rows": [[document[key] for key in row] for row in keys]}, file.name, _HINT)
     pose = rigid_matrix(matrix.rows, f"{file.name} t_00")[0] @ OPENCV_FROM_OPENGL
     full = FullParameters(camera.fx, camera.fy, camera.cx, camera.cy)
-    return np.asarray(pose), lens_of(full, file.name, (camera.width, camera.height))
+    sized = camera.width and camera.height
+    lens = lens_of(full, file.name, (camera.width, camera.height)) if sized else None
+    return np.asarray(pose), lens or at_size_of(lambda *size: lens_of(full, file.name, size))
 
 
 def _recognises(place: Path) -> bool:

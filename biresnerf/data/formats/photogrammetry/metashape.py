@@ -1,7 +1,8 @@
 """Metashape's camera export (XML): sensors, cameras, and their poses in the chunk's own frame.
 
 Lens: Agisoft Metashape user manual, appendix on camera models ("frame" type). Its p1 and p2 are COLMAP's p2 and p1. b2
-is skew, which is taken out of the photos.
+is skew, which is taken out of the photos. The cameras of a rig have their master's pose, moved by the rotation and
+location of their sensor, which lead from its frame to the master's: metashape_to_krt.py, a converter of Meta's.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from collections import Counter
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import TypeAlias
 from xml.etree import ElementTree
 
 import numpy as np
@@ -60,14 +62,18 @@ def parse_metashape(_root: Path, file: Path) -> ParsedPoses:
         camera.get("component_id") for camera in cameras.values() if camera.find("transform") is not None
     )
     main = components.most_common(1)[0][0] if components else None
+    by_id = {camera.get("id"): camera for camera in cameras.values()}
     lenses: dict[str | None, Camera | InputError | None] = {}
     entries, apart = [], []
     for label, camera in sorted(cameras.items()):
         where, sensor = f"{file.name} camera {label!r}", camera.get("sensor_id")
         if sensor not in lenses:
             lenses[sensor] = attempt(partial(_camera, sensors.get(sensor), f"{file.name} sensor {sensor}"))
-        entry = entry_of(label, where, partial(_read, camera, lenses[sensor], where))
-        if entry.world_from_cam is not None and camera.get("component_id") != main:
+        master = by_id.get(camera.get("master_id"))
+        rig = None if master is None else (master, sensors.get(sensor))
+        entry = entry_of(label, where, partial(_read, camera, rig, lenses[sensor], where))
+        placed = camera if master is None else master
+        if entry.world_from_cam is not None and placed.get("component_id") != main:
             entry = replace(entry, world_from_cam=None)
             apart.append(label)
         entries.append(entry)
@@ -107,10 +113,27 @@ def cameras_by_label(chunk: ElementTree.Element, file: Path) -> dict[str, Elemen
     return entries
 
 
-def _read(camera: ElementTree.Element, lens: Camera | InputError | None, where: str) -> Placed:
+_Rig: TypeAlias = tuple[ElementTree.Element, ElementTree.Element | None] | None
+
+
+def _read(camera: ElementTree.Element, rig: _Rig, lens: Camera | InputError | None, where: str) -> Placed:
+    """Pose and lens of a camera; ``rig``: its master and its own sensor."""
     if isinstance(lens, InputError):
         raise lens
-    return _pose(camera, where), lens
+    pose = _pose(camera, where)
+    if pose is None and rig is not None:
+        world_from_master, sensor = _pose(rig[0], where), rig[1]
+        if world_from_master is not None and sensor is not None:
+            pose = world_from_master @ _master_from_sensor(sensor, where)
+    return pose, lens
+
+
+def _master_from_sensor(sensor: ElementTree.Element, where: str) -> NDArray[np.float64]:
+    rotation = finite_numbers((sensor.findtext("rotation") or "1 0 0 0 1 0 0 0 1").split(), where, _HINT)
+    location = finite_numbers((sensor.findtext("location") or "0 0 0").split(), where, _HINT)
+    if (len(rotation), len(location)) != (9, 3):
+        raise invalid_file(where, "the sensor's rotation has not 9 numbers, or its location not 3.", _HINT)
+    return rigid_matrix(np.column_stack([rotation.reshape(3, 3), location]).tolist(), where)[0]
 
 
 def _pose(entry: ElementTree.Element, where: str) -> NDArray[np.float64] | None:

@@ -208,7 +208,7 @@ def _write_lines(path: Path, lines: list[str]) -> None:
 
 
 CODECS = (
-    Codec(TRAJECTORY, parse=parse_trajectory, recognises=_is_trajectory),
+    Codec(TRAJECTORY, parse=parse_trajectory, recognises=_is_trajectory, loose=True),
     Codec(TUM, write=lambda refined, path, _: write_tum(refined, path)),
     Codec(
         KITTI,

@@ -54,14 +54,49 @@ def record3d(folder: Path, name="metadata.json", photos="rgb/{}.jpg", per_frame=
     return refined
 
 
-def polycam(folder: Path, cameras="keyframes/corrected_cameras", photos="keyframes/corrected_images/{}.jpg"):
+def polycam(
+    folder: Path,
+    cameras="keyframes/corrected_cameras",
+    photos="keyframes/corrected_images/{}.jpg",
+    size=(("width", 64), ("height", 48)),
+):
     """nerfstudio, but for its exchange of the world's axes: OpenGL axes by rows, in ARKit's world."""
     refined = result(photos)
     for index, pose in enumerate(refined.world_from_cam):
         opengl = pose @ FLIP
         values = {f"t_{row}{column}": opengl[row, column] for row in range(3) for column in range(4)}
-        lens = {"fx": 70.0, "fy": 72.0, "cx": 31.0, "cy": 25.5, "width": 64, "height": 48, "blur_score": 90}
+        lens = {"fx": 70.0, "fy": 72.0, "cx": 31.0, "cy": 25.5, "blur_score": 90, **dict(size)}
         dump(folder / cameras / f"{index}.json", lens | values)
+    return refined
+
+
+def scanner_app(folder: Path):
+    """A real capture: OpenGL axes by rows; the lens is of a larger picture, whose size the projection tells."""
+    refined = result("frame_{:05}.jpg")
+    for index, pose in enumerate(refined.world_from_cam):
+        frame = {
+            "cameraPoseARFrame": (pose @ FLIP).ravel().tolist(),
+            "intrinsics": [210.0, 0, 93.0, 0, 216.0, 76.5, 0, 0, 1],
+            "projectionMatrix": [420 / 192, 0, 0, 0, 0, 432 / 144, *[0] * 10],
+        }
+        dump(folder / f"frame_{index:05}.json", frame)
+        write_image(folder / f"depth_{index:05}.png", index, mode="L")
+        for more in range(2):  # frames without a photo
+            dump(folder / f"frame_{5 + 2 * index + more:05}.json", frame)
+    return refined
+
+
+def realestate10k(folder: Path, times=True):
+    """Its description: shares of the width and height, world to camera."""
+    refined = result("frames/{}.jpg")
+    stamps = [46_012_000 + 33_367 * index for index in range(5)] if times else range(5)
+    refined = renamed(refined, [f"frames/{stamp}.jpg" for stamp in stamps])
+    lines = ["https://www.youtube.com/watch?v=x"]
+    for stamp, pose in zip(stamps, refined.world_from_cam, strict=True):
+        lens = [70 / 64, 72 / 48, 31 / 64, 25.5 / 48, 0, 0]
+        values = [*lens, *np.linalg.inv(pose)[:3].ravel().tolist()]
+        lines.append(" ".join([str(stamp if times else 1000 * stamp), *map(repr, values)]))
+    dump(folder / "000c3ab189999a83.txt", "\n".join(lines) + "\n")
     return refined
 
 

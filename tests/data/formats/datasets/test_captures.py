@@ -21,7 +21,9 @@ from tests.data.formats.datasets.captures import (
     mvsnet,
     nerfies,
     polycam,
+    realestate10k,
     record3d,
+    scanner_app,
     sdfstudio,
     tanks_and_temples,
 )
@@ -35,6 +37,8 @@ CASES = {
     "bop": (bop, "scene_camera.json"),
     "sdfstudio": (sdfstudio, "meta_data.json"),
     "nerfies": (nerfies, "camera/000000.json"),
+    "3d-scanner-app": (scanner_app, "frame_00000.json"),
+    "realestate10k": (realestate10k, "000c3ab189999a83.txt"),
     "euroc": (euroc, "mav0/state_groundtruth_estimate0/data.csv"),
 }
 VARIANTS = {
@@ -45,7 +49,9 @@ VARIANTS = {
     "polycam": [
         lambda folder: polycam(folder, "corrected_cameras", "corrected_images/{}.jpg"),
         lambda folder: polycam(folder, "keyframes/cameras", "keyframes/images/{}.jpg"),
+        lambda folder: polycam(folder, size=()),
     ],
+    "realestate10k": [lambda folder: realestate10k(folder, times=False)],
     "nerfies": [lambda folder: nerfies(folder, "tangential")],
     "euroc": [
         lambda folder: euroc(folder, "equidistant"),

@@ -65,7 +65,22 @@ def mobilebrick(folder: Path) -> list[str]:
     return [f"image/{i:06}.jpg" for i in range(5)]
 
 
+def nerfplusplus(folder: Path) -> list[str]:
+    """A matrix in one line; pixels count from the corner."""
+    four = np.eye(4)
+    four[:3, :3] = K + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    for i, pose in enumerate(POSES):
+        matrix(folder / f"train/pose/{i:04}.txt", pose.reshape(1, 16))
+        matrix(folder / f"train/intrinsics/{i:04}.txt", four.reshape(1, 16))
+        matrix(folder / f"camera_path/pose/{i:04}.txt", np.eye(4).reshape(1, 16))
+        write_image(folder / f"train/rgb/{i:04}.png", i)
+    matrix(folder / "test/pose/0007.txt", POSES[0].reshape(1, 16))
+    write_image(folder / "test/rgb/0007.png", 7)
+    return [f"rgb/{i:04}.png" for i in range(5)]
+
+
 SETS = {
+    "nerfplusplus": nerfplusplus,
     "scannet": scannet,
     "nsvf": nsvf,
     "3dmatch": threedmatch,

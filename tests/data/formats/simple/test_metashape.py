@@ -12,6 +12,7 @@ from biresnerf.data.formats.parsed_poses import without_problems
 from biresnerf.data.formats.photogrammetry.metashape import parse_metashape
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera import Intrinsics, project
+from tests.data.formats.random_sets import random_poses
 from tests.data.formats.simple.trajectories import metashape_xml
 
 WIDTH, HEIGHT = 20, 16
@@ -88,6 +89,31 @@ def test_the_largest_component_alone_has_poses(tmp_path):
     result = parsed(tmp_path, cameras=cameras)
     assert [entry.name for entry in result.entries if entry.world_from_cam is None] == ["3.png"]
     assert any("3.png" in note for note in result.notes)
+
+
+def test_the_cameras_of_a_rig_have_their_masters_pose_moved_by_their_sensor(tmp_path):
+    masters = random_poses(np.random.default_rng(3), 3)
+    master_from_slave = random_poses(np.random.default_rng(4), 1)[0]
+    placed = [f"<transform>{' '.join(map(repr, pose.ravel().tolist()))}</transform>" for pose in masters]
+    cameras = "".join(camera(n, text) for n, text in enumerate(placed)) + camera(3, "")
+    cameras += "".join(
+        camera(10 + n, "", f'master_id="{n}"').replace('sensor_id="0"', 'sensor_id="1"') for n in range(4)
+    )
+    place = "".join(
+        f"<{name}>{' '.join(map(repr, values.ravel().tolist()))}</{name}>"
+        for name, values in (("rotation", master_from_slave[:3, :3]), ("location", master_from_slave[:3, 3]))
+    )
+    one, end = "<sensor id=", "</sensors>"
+    export = metashape_xml(cameras=cameras)
+    sensor = export[export.index(one) : export.index(end)]
+    slave = sensor.replace('id="0"', 'id="1" master_id="0"').replace("</sensor>", f"{place}</sensor>")
+    (tmp_path / "cameras.xml").write_text(export.replace(end, slave + end))
+    entries = {entry.name: entry for entry in parse_metashape(tmp_path, tmp_path / "cameras.xml").entries}
+    for n, pose in enumerate(masters):
+        np.testing.assert_allclose(entries[f"{n}.png"].world_from_cam, pose, atol=1e-12)
+        found = entries[f"{10 + n}.png"].world_from_cam
+        np.testing.assert_allclose(found, pose @ master_from_slave, atol=1e-12)
+    assert entries["13.png"].world_from_cam is None  # its master has none
 
 
 def test_an_entity_is_refused_before_it_expands(tmp_path):
