@@ -9,8 +9,9 @@ from pathlib import Path
 
 from biresnerf.data.formats.bad_frames import attempt, good_frames
 from biresnerf.data.formats.parsed_poses import FrameCamera, PoseEntry
-from biresnerf.data.photos.guessed_lens import guess_lens
+from biresnerf.data.photos.guessed_lens import guess_lens, lens_doubts, refuse_other_units
 from biresnerf.data.photos.image_files import ImageHeader, read_header
+from biresnerf.data.photos.kinds.panorama import panorama
 from biresnerf.data.photos.orientation import (
     meant_orientations,
     orientation_notes,
@@ -52,7 +53,7 @@ def read_photos(images: Sequence[tuple[Path, PoseEntry]], *, strict: bool) -> Po
     turns = meant_orientations(stored, [_declared_size(entry) for _, entry in images])
     headers = [turned_header(header, turn) for header, turn in zip(stored, turns, strict=True)]
     lenses = [
-        attempt(partial(_camera_of, entry, header))
+        attempt(partial(_sound_camera, entry, header))
         for (_, entry), header in zip(images, headers, strict=True)
     ]
     found, kept, more = good_frames(lenses, [entry.name for _, entry in images], strict=strict)
@@ -66,6 +67,22 @@ def read_photos(images: Sequence[tuple[Path, PoseEntry]], *, strict: bool) -> Po
 
 def _declared_size(entry: PoseEntry) -> tuple[float | None, float | None]:
     return (entry.lens.width, entry.lens.height) if isinstance(entry.lens, Camera) else entry.size
+
+
+def _sound_camera(entry: PoseEntry, header: ImageHeader) -> FrameCamera:
+    """The entry's camera, if its photo is no panorama and its numbers are those of a lens, with notes on doubts.
+
+    Raises:
+        InputError: ``camera_model_unsupported``, ``intrinsics_invalid``, or a code of `_camera_of`.
+    """
+    found = _camera_of(entry, header)
+    # Views that were cut from a panorama may still say that they are one: they are no 2 : 1, or have a lens.
+    if header.equirectangular and (found.source != "given" or header.width == 2 * header.height):
+        raise panorama("its metadata say that it is equirectangular", entry.name)
+    if found.source != "given":
+        return found
+    refuse_other_units(found.camera, entry.where)
+    return found._replace(notes=(*found.notes, *lens_doubts(found.camera, header)))
 
 
 def _camera_of(entry: PoseEntry, header: ImageHeader) -> FrameCamera:

@@ -1,4 +1,4 @@
-"""A first guess of the lens of a photo without given intrinsics: EXIF's focal length, else a normal lens."""
+"""A first guess of a lens that is not given (EXIF's focal length, else a normal lens), and doubts of one that is."""
 
 from __future__ import annotations
 
@@ -6,13 +6,18 @@ import math
 
 from biresnerf.data.model.dataset import IntrinsicsSource
 from biresnerf.data.photos.image_files import ImageHeader
-from biresnerf.geometry.camera.camera_models import Camera
+from biresnerf.errors import InputError
+from biresnerf.geometry.camera.camera_models import Camera, FullParameters
 
 GUESSED_FOCAL = 1.2  # of the long side, as COLMAP guesses: a field of view of 45 degrees, a normal lens
 FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
 PLAUSIBLE = (0.25, 20.0)  # of the long side, the focal length: angles of view of 127 to 3 degrees
 # EXIF's two ways of telling the focal length; the sensor's is the finer one, and more often wrong.
 AGREE = 0.1
+CONTRADICTS = 1.5  # by this factor EXIF's focal length and a given one differ, and not for a crop or a zoom
+MOST_VIEW_DEG = 150.0  # lenses that keep straight lines straight see 130 degrees or so
+LEAST_MM = 2.0  # lenses of phones have that much; shares of the width are smaller
+LEAST_SIDE = 16  # px; in smaller photos the first pixel is no corner
 
 
 def guess_lens(header: ImageHeader) -> tuple[Camera, IntrinsicsSource]:
@@ -28,6 +33,56 @@ def guess_note(source: IntrinsicsSource) -> str:
     """A note for the user on a lens that `guess_lens` found."""
     found = "taken from EXIF" if source == "exif" else "a guess"
     return f"no intrinsics are given: the focal length is {found}"
+
+
+def refuse_other_units(camera: Camera, where: str) -> None:
+    """Raises InputError ``intrinsics_invalid`` for a lens that sees more than one can, as other units make it."""
+    full, w, h = camera.full(), camera.width, camera.height
+    hint = (
+        "Give the focal length and the principal point in pixels: shares of the photo are multiplied by its width "
+        "and height, millimetres divided by the sensor's width and multiplied by the photo's."
+    )
+    in_corner = 0 <= full.cx <= 1 and 0 <= full.cy <= 1 and min(w, h) >= LEAST_SIDE
+    view = _view_deg(full, w, h)
+    if view > MOST_VIEW_DEG and not full.fisheye:
+        share = in_corner or full.fx < LEAST_MM
+        looks = "it looks like a share of the photo's width" if share else "it looks like millimetres"
+        what = (
+            f"a focal length of {full.fx:.4g} px on a photo of {w} x {h} px is an angle of view of {view:.0f} degrees: "
+            f"{looks}."
+        )
+        raise InputError("intrinsics_invalid", what, where=where, hint=hint)
+    if in_corner:
+        what = (
+            f"the principal point ({full.cx:g}, {full.cy:g}) lies in the corner of a photo of {w} x {h} px: it looks "
+            "like shares of the photo's width and height."
+        )
+        raise InputError("intrinsics_invalid", what, where=where, hint=hint)
+
+
+def lens_doubts(camera: Camera, header: ImageHeader) -> tuple[str, ...]:
+    """Notes on a given lens of a photo that is most unusual, or that its EXIF contradicts."""
+    full, side = camera.full(), max(camera.width, camera.height)
+    least, most = PLAUSIBLE
+    doubts = []
+    if not full.fisheye and not least * side <= full.fx <= most * side:
+        view = _view_deg(full, camera.width, camera.height)
+        doubts.append(
+            f"the focal length of {full.fx:.4g} px is an angle of view of {view:.3g} degrees, which few lenses "
+            "have: it must be in pixels, of photos of this size"
+        )
+    exif = exif_focal_px(header)
+    if exif is not None and not 1 / CONTRADICTS < full.fx / exif < CONTRADICTS:
+        doubts.append(
+            f"the focal length is given as {full.fx:.4g} px, and EXIF says {exif:.4g} px: it may be of photos of "
+            "another size, or in another unit"
+        )
+    return tuple(doubts)
+
+
+def _view_deg(full: FullParameters, width: int, height: int) -> float:
+    """The angle of view (degrees) across the photo's width or height, whichever is larger, without distortion."""
+    return 2 * math.degrees(math.atan(max(0.5 * width / full.fx, 0.5 * height / full.fy)))
 
 
 def exif_focal_px(header: ImageHeader) -> float | None:

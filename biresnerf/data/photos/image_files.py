@@ -15,6 +15,7 @@ from PIL import Image
 from PIL.TiffImagePlugin import TiffImageFile
 
 from biresnerf.data.photos.kinds import linear_light, raw_file
+from biresnerf.data.photos.kinds.panorama import says_equirectangular
 from biresnerf.data.photos.kinds.photo_kinds import (
     HEIC,
     PLAIN_SUFFIXES,
@@ -68,6 +69,7 @@ class ImageHeader(NamedTuple):
         focal_35mm: the focal length, mm, that sees as much on 35 mm film (36 x 24 mm).
         focal_plane: the sensor's resolution, which makes pixels of `focal_mm`.
         several: the file holds more pages or frames than the first one.
+        equirectangular: its XMP calls it a panorama of this projection.
     """
 
     width: int
@@ -77,6 +79,7 @@ class ImageHeader(NamedTuple):
     focal_35mm: float | None = None
     focal_plane: FocalPlane | None = None
     several: bool = False
+    equirectangular: bool = False
 
 
 @contextmanager
@@ -200,7 +203,9 @@ def read_header(path: Path, name: str) -> ImageHeader:
 
 def header_of(image: Image.Image) -> ImageHeader:
     """Size, EXIF orientation and focal length of an opened image that is not decoded yet."""
-    header = ImageHeader(*stored_size(image), several=_holds_several(image))
+    header = ImageHeader(
+        *stored_size(image), several=_holds_several(image), equirectangular=says_equirectangular(image)
+    )
     return from_exif(image, lambda exif: _with_exif(header, exif)) or header
 
 

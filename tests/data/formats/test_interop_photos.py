@@ -34,6 +34,9 @@ READ = {
     "46_png_beside_jpg/set": (6, 6, "0001.jpg (not 0001.png)"),
 }
 REFUSED = {
+    "32_panoramas_taken_as_perspective/metashape_spherical": ("camera_model_unsupported", "spherical"),
+    "32_panoramas_taken_as_perspective/photos": ("camera_model_unsupported", "equirectangular"),
+    "33_focal_in_other_units/normalised": ("intrinsics_invalid", "looks like a share of the photo's width"),
     "45_unread_kinds_in_images/jp2": ("no_images", "4 JPEG 2000 (images/0001.jp2"),
 }
 

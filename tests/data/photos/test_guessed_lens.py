@@ -7,10 +7,14 @@ from pathlib import Path
 
 import pytest
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.photos.guessed_lens import exif_focal_px, guess_lens
 from biresnerf.data.photos.image_files import FocalPlane, ImageHeader
+from biresnerf.errors import InputError
+from tests.data.formats.simple import trajectories
+from tests.data.scenes import assert_complete, nerfstudio_scene, save
 
 FULL_FRAME = FocalPlane(6000 / 36, 4000 / 24, 6000, 4000)
 
@@ -59,3 +63,103 @@ def test_a_folder_has_a_camera_for_each_focal_length_and_says_where_it_comes_fro
     assert [frame.camera for frame in dataset.frames] == [0, 0, 1, 2]
     assert dataset.intrinsics_sources == ("exif", "exif", "guessed")
     assert [round(c.params[0], 3) for c in dataset.cameras] == [233.333, 416.667, 360.0]
+
+
+def _set_with_lens(folder: Path, lens: dict[str, float], exif: Image.Exif | None = None) -> Path:
+    """Four photos of 80 x 60 px in a circle, whose transforms.json has this lens."""
+    document = nerfstudio_scene(folder)
+    for key in ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2", "camera_angle_x"):
+        document.pop(key, None)
+    document |= lens
+    for number, frame in enumerate(document["frames"]):
+        picture = Image.new("RGB", (80, 60), (number, 9, 9))
+        picture.save(folder / frame["file_path"], exif=Image.Exif() if exif is None else exif)
+    return save(folder, document)
+
+
+@pytest.mark.parametrize(
+    ("lens", "said"),
+    [
+        ({"fl_x": 1.27, "fl_y": 0.72, "cx": 0.5, "cy": 0.5}, "share of the photo's width"),
+        ({"fl_x": 1.27}, "share of the photo's width"),
+        ({"fl_x": 4.3}, "looks like millimetres"),
+        ({"fl_x": 28.0, "w": 640, "h": 480}, "angle of view of 170 degrees: it looks like millimetres"),
+        ({"camera_angle_x": 2.7}, "angle of view of 155 degrees"),
+        ({"fl_x": 90.0, "fl_y": 90.0, "cx": 0.5, "cy": 0.5}, "principal point (0.5, 0.5) lies in the corner"),
+        ({"fl_x": 90.0, "fl_y": 1.1}, "angle of view of 176 degrees"),
+    ],
+)
+def test_a_lens_in_other_units_than_pixels_is_refused_by_what_it_looks_like(tmp_path, lens, said):
+    with pytest.raises(InputError) as caught:
+        read_dataset(_set_with_lens(tmp_path, lens))
+    assert_complete(caught.value, "intrinsics_invalid", "transforms.json", "frames[0]")
+    assert said in caught.value.detail
+    assert "in pixels" in caught.value.hint
+
+
+def test_the_lens_of_any_format_is_looked_at(tmp_path):
+    trajectories.colmap_set(tmp_path, lens="PINHOLE 20 16 0.9 1.1 0.5 0.5")
+    with pytest.raises(InputError, match="share of the photo's width") as caught:
+        read_dataset(tmp_path)
+    assert caught.value.code == "intrinsics_invalid"
+
+
+@pytest.mark.parametrize(
+    ("lens", "said"),
+    [
+        ({"fl_x": 90.0, "fl_y": 90.0, "cx": 41.0, "cy": 28.0}, None),
+        ({"fl_x": 28.0, "cx": 41.0, "cy": 28.0}, None),  # 110 degrees: an action camera's
+        ({"fl_x": 30.0, "camera_model": "OPENCV_FISHEYE", "cx": 41.0, "cy": 28.0}, None),
+        ({"fl_x": 15.0, "cx": 41.0, "cy": 28.0}, "angle of view of 139 degrees, which few lenses have"),
+        ({"fl_x": 5000.0, "cx": 41.0, "cy": 28.0}, "angle of view of 0.917 degrees, which few lenses have"),
+    ],
+)
+def test_an_unusual_lens_is_read_and_said(tmp_path, lens, said):
+    warnings = read_dataset(_set_with_lens(tmp_path, lens)).warnings
+    assert [text for text in warnings if "focal length" in text] == [
+        t for t in warnings if said and said in t
+    ]
+    assert len(warnings) == (said is not None)
+
+
+def test_a_focal_length_that_exif_contradicts_is_said(tmp_path):
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA405] = 35  # 81 px of 80 x 60
+    lens = {"cx": 40.0, "cy": 30.0}
+    assert read_dataset(_set_with_lens(tmp_path / "a", lens | {"fl_x": 80.0}, exif)).warnings == ()
+    warnings = read_dataset(_set_with_lens(tmp_path / "b", lens | {"fl_x": 35.0}, exif)).warnings
+    assert any("given as 35 px, and EXIF says 80.89 px" in text for text in warnings)
+
+
+XMP = '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF><rdf:Description {}/></rdf:RDF></x:xmpmeta>'
+GPANO = XMP.format('GPano:ProjectionType="equirectangular"').encode()
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".webp", ".tif", ".png"])
+def test_panoramas_are_refused_and_what_to_do_with_them_is_said(tmp_path, suffix):
+    text = PngInfo()
+    text.add_itxt("XML:com.adobe.xmp", GPANO.decode())
+    told = {".tif": {"tiffinfo": {700: GPANO}}, ".png": {"pnginfo": text}}.get(suffix, {"xmp": GPANO})
+    for number in range(4):
+        Image.new("RGB", (80, 40), (number, 9, 9)).save(tmp_path / f"{number}{suffix}", **told)
+    with pytest.raises(InputError) as caught:
+        read_dataset(tmp_path)
+    assert_complete(caught.value, "camera_model_unsupported", f"0{suffix}")
+    assert "perspective views" in caught.value.hint
+
+
+def test_one_panorama_among_photos_is_left_out(tmp_path):
+    for number in range(4):
+        Image.new("RGB", (80, 40), (number, 9, 9)).save(
+            tmp_path / f"{number}.jpg", xmp=GPANO if number == 1 else b""
+        )
+    dataset = read_dataset(tmp_path)
+    assert dataset.names == ("0.jpg", "2.jpg", "3.jpg")
+    assert any("1.jpg" in text and "equirectangular" in text for text in dataset.warnings)
+
+
+def test_views_cut_from_a_panorama_that_kept_its_metadata_are_read_with_their_lens(tmp_path):
+    save(tmp_path, nerfstudio_scene(tmp_path))
+    for path in (tmp_path / "images").iterdir():
+        Image.open(path).save(path, xmp=GPANO)
+    assert read_dataset(tmp_path).posed.all()

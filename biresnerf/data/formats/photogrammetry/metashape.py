@@ -26,6 +26,7 @@ from biresnerf.data.formats.pose_rows import Placed, entry_of, shear_of, without
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.untrusted_file import finite_numbers, invalid_file
+from biresnerf.data.photos.kinds.panorama import panorama
 from biresnerf.data.photos.photo_folders import few_names
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
@@ -152,10 +153,10 @@ def _camera(sensor: ElementTree.Element | None, where: str) -> Camera | None:
         return None
     found = sensor.findall("calibration")
     adjusted = [one for one in found if one.get("class") == "adjusted"]
-    if not found:
-        return None
-    calibration = (adjusted or found)[0]
-    kind = calibration.get("type") or sensor.get("type") or "frame"
+    calibration = next(iter(adjusted or found), None)
+    kind = (None if calibration is None else calibration.get("type")) or sensor.get("type") or "frame"
+    if kind in ("spherical", "cylindrical"):
+        raise panorama(f"the camera type is {kind}", where)
     if kind != "frame":
         raise InputError(
             "camera_model_unsupported",
@@ -163,6 +164,8 @@ def _camera(sensor: ElementTree.Element | None, where: str) -> Camera | None:
             where=where,
             hint="Export undistorted images and cameras of the type frame.",
         )
+    if calibration is None:
+        return None
     values = {}
     for name in ("f", "fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2"):
         numbers = finite_numbers(calibration.findtext(name, "").split(), where, _HINT)

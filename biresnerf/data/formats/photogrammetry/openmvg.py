@@ -27,7 +27,7 @@ from biresnerf.data.formats.pose_rows import folder_with_photos, lens_of
 from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.model.untrusted_file import checked, invalid_file, read_json_object
-from biresnerf.errors import InputError
+from biresnerf.data.photos.kinds.panorama import panorama
 from biresnerf.geometry.camera.camera_models import Camera, FullParameters
 from biresnerf.options.formats import Format
 
@@ -120,12 +120,7 @@ def _pointed(value: Any) -> Any:
 
 def _read_lens(value: Any, where: str) -> Camera:
     if isinstance(value, dict) and "focal_length" not in value:
-        raise InputError(
-            "camera_model_unsupported",
-            "has no focal length, as a spherical camera, which is not supported.",
-            where=where,
-            hint="Give perspective or fisheye images.",
-        )
+        raise panorama("has no focal length, as a spherical camera", where)
     lens = checked(_Lens, value, where, _HINT)
     key = next((key for key in _COEFFICIENTS if key in value), None)
     names = _COEFFICIENTS[key] if key else ()

@@ -29,6 +29,7 @@ from biresnerf.data.model.colmap_scene import matrix_of_pose
 from biresnerf.data.model.conventions import quat_wxyz_from_rotation
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.model.untrusted_file import checked, invalid_file, read_json
+from biresnerf.data.photos.kinds.panorama import panorama
 from biresnerf.data.photos.photo_folders import IMAGE_FOLDER
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera, FullParameters
@@ -142,6 +143,8 @@ def world_from_cam_of_vector(rotation: _Vector, translation: _Vector, where: str
 def _read_lens(value: Any, where: str) -> Camera | LensOf:
     lens = checked(_Lens, value, where, _HINT)
     kind = lens.projection_type
+    if kind in ("spherical", "equirectangular"):
+        raise panorama(f"the camera type is {kind}", where)
     if kind not in _LENSES:
         raise InputError(
             "camera_model_unsupported",

@@ -9,6 +9,7 @@ from biresnerf.data.formats.parsed_poses import FrameCamera
 from biresnerf.data.formats.transforms.write_intrinsics import FOCAL_KEYS
 from biresnerf.data.photos.guessed_lens import guess_lens, guess_note
 from biresnerf.data.photos.image_files import ImageHeader
+from biresnerf.data.photos.kinds.panorama import panorama
 from biresnerf.data.photos.orientation import same_shape
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import (
@@ -23,7 +24,7 @@ from biresnerf.geometry.camera.lens import lens_problem
 
 _UNSUPPORTED = "camera_model_unsupported"
 # Keys of instant-ngp that mean a lens of neither family.
-_OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular")
+_F_THETA, _PANORAMAS = "ftheta_p0", ("latlong", "equirectangular")
 _FOCAL_DIFFERS = 0.01  # angles in files have few digits
 _MODEL_HINT = (
     f"Supported are {', '.join(MODEL_IDS)}; undistort the images to one of them "
@@ -117,10 +118,12 @@ def _short(value: Any) -> str:
 
 def _declared_lens(fields: Fields) -> tuple[str | None, bool]:
     """The model that the file names, and whether the lens is a fisheye's."""
-    for key in _OTHER_LENSES:
-        if fields.frame.get(key) or fields.top.get(key):
-            raise _unsupported(fields, key, f"{key}: panoramas and f-theta lenses are not supported.")
     declared = fields.frame.get("camera_model") or fields.top.get("camera_model")
+    for key in _PANORAMAS:
+        if fields.frame.get(key) or fields.top.get(key) or str(declared).lower() == key:
+            raise panorama(key, fields.where(key if str(declared).lower() != key else "camera_model"))
+    if fields.frame.get(_F_THETA) or fields.top.get(_F_THETA):
+        raise _unsupported(fields, _F_THETA, f"{_F_THETA}: f-theta lenses are not supported.")
     if declared is not None and (not isinstance(declared, str) or declared.upper() not in MODEL_IDS):
         raise _unsupported(fields, "camera_model", f"the camera model {_short(declared)} is not supported.")
     model = None if declared is None else declared.upper()
