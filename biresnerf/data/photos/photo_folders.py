@@ -19,6 +19,8 @@ from biresnerf.errors import InputError
 IMAGE_FOLDER = "images"
 # Folders of the photos themselves where others hold something else of the same views; the preferred one first.
 _USUAL = ("rgb", "color", "colour", "image", "image_2", "image_0", "train")
+# Folders of the photos of images/ at a half, a quarter or so of their size, as LLFF and nerfstudio write them.
+COPIES = re.compile(rf"{IMAGE_FOLDER}_(\d+)")
 # Words by which programs call what they make of photos: maps and small copies, in files beside them or in folders.
 _MAPS = frozenset(
     {
@@ -82,7 +84,8 @@ def photos_beside(root: Path, folders: Sequence[str] = ()) -> dict[str, Path]:
 
     Those in the first of ``folders`` that has some, which the poses' program uses; else those of `images_beside`; else
     those in the one other folder that has some; of several, in the first that is called as folders of photos usually
-    are (rgb/, color/, image_2/), or in all of them where only a number tells their names apart (cam0/, cam1/).
+    are (rgb/, color/, image_2/), or in all of them where only a number tells their names apart (cam0/, cam1/). Of
+    images_4/ and images_8/, which hold smaller copies, the first counts.
     """
     for name in folders:
         paths = images_below(root / name)
@@ -91,11 +94,18 @@ def photos_beside(root: Path, folders: Sequence[str] = ()) -> dict[str, Path]:
     beside = images_beside(root)
     if beside:
         return beside
-    found = folders_of_photos(root)
+    found = _largest_copies(folders_of_photos(root))
     if len({re.sub(r"\d+", "", name) for name in found}) == 1:
         return by_path(root, [path for paths in found.values() for path in paths])
     usual = next((name for name in _USUAL if name in found), None)
     return by_path(root, found[usual]) if usual else {}
+
+
+def _largest_copies(folders: dict[str, list[Path]]) -> dict[str, list[Path]]:
+    """The folders without smaller copies of the photos of one of them: images_8/ beside images_4/."""
+    times = {name: int(found[1]) for name in folders if (found := COPIES.fullmatch(name))}
+    least = min(times.values(), default=0)
+    return {name: paths for name, paths in folders.items() if times.get(name, least) == least}
 
 
 def all_photos(root: Path) -> dict[str, Path]:

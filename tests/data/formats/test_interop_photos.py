@@ -31,6 +31,7 @@ READ = {
     "37_pictures_that_are_no_photos/odm_masks": (6, 0, "masks were found for 6 of 6"),
     "38_masks_under_other_names/stem": (6, 6, "masks were found for 6 of 6"),
     "38_masks_under_other_names/beside": (6, 6, "masks were found for 6 of 6"),
+    "40_only_images_8/set": (8, 8, "in a folder of smaller copies (images/0001.jpg is images_8/0001.jpg)"),
     "46_png_beside_jpg/set": (6, 6, "0001.jpg (not 0001.png)"),
 }
 REFUSED = {

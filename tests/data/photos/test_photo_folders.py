@@ -86,6 +86,12 @@ def test_files_of_kinds_that_are_not_read_are_named(tmp_path):
     assert "3 JPEG 2000 files are not read and left out" in " ".join(read_dataset(tmp_path).warnings)
 
 
+def test_smaller_copies_of_photos_count_once(tmp_path):
+    for folder in ("images_8", "images_4", "images_16"):
+        _pictures(tmp_path / folder, ["1.jpg", "2.jpg", "3.jpg"])
+    assert set(read_dataset(tmp_path).names) == {f"images_4/{number}.jpg" for number in (1, 2, 3)}
+
+
 def test_a_folder_of_files_that_nobody_knows_is_said_with_their_kinds(tmp_path):
     (tmp_path / "images").mkdir()
     (tmp_path / "images/1.xyz").touch()

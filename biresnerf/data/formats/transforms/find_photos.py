@@ -4,16 +4,24 @@ from __future__ import annotations
 
 import posixpath
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 from biresnerf.data.formats.bad_frames import attempt, good_frames, tolerate
-from biresnerf.data.formats.match_names import ENDS, SAME_PATH, match_files
-from biresnerf.data.formats.parsed_poses import PoseEntry
-from biresnerf.data.photos.image_files import images_called
+from biresnerf.data.formats.match_names import ENDS, SAME_PATH, Rule, match_files
+from biresnerf.data.formats.parsed_poses import FrameCamera, PoseEntry
+from biresnerf.data.photos.image_files import ImageHeader, images_called
 from biresnerf.data.photos.named_images import lies_in, refuse_outside
-from biresnerf.data.photos.photo_folders import by_path, few_names, images_below
+from biresnerf.data.photos.photo_folders import COPIES, IMAGE_FOLDER, by_path, few_names, images_below
 from biresnerf.errors import InputError
+
+_OF_COPIES: tuple[Rule, ...] = (
+    (
+        "in a folder of smaller copies",
+        lambda name: posixpath.splitext(COPIES.sub(IMAGE_FOLDER, _plain(name).casefold(), count=1))[0],
+    ),
+)
 
 
 def find_photos(
@@ -59,11 +67,19 @@ def find_photos(
         error = InputError("image_missing", f"{listed}.", where=f"{missing[0].where}.file_path", hint=hint)
         tolerate(len(missing), len(entries), error, strict=strict)
         notes.append(f"{listed}; their frames are left out")
-    pairs = [(found[entry.name], entry) for entry in entries if entry.name in found]
+    pairs = [
+        (path, _of_copy(path, file, entry))
+        for entry in entries
+        if (path := found.get(entry.name)) is not None
+    ]
     places: dict[str, PoseEntry] = {}
     first_uses = [attempt(partial(_used_once, pair, places)) for pair in pairs]
     once, _, twice = good_frames(first_uses, [entry.name for _, entry in pairs], strict=strict)
     return once, [*nameless, *notes, *twice]
+
+
+def _plain(name: str) -> str:
+    return posixpath.normpath(name.replace("\\", "/"))
 
 
 def _with_name(entry: PoseEntry) -> PoseEntry:
@@ -105,7 +121,32 @@ def _find_elsewhere(
         matched, said = match_files(some, free, rules)
         found |= {name: files[path] for name, path in matched.items()}
         notes += said
-    return notes
+    copies = [name for name in free if COPIES.fullmatch(name.split("/")[0])]
+    least = min((_times_smaller(name) for name in copies), default=0)
+    copies = [name for name in copies if _times_smaller(name) == least]
+    matched, said = match_files([name for name in missing if name not in found], copies, _OF_COPIES)
+    found |= {name: files[path] for name, path in matched.items()}
+    return notes + said
+
+
+def _times_smaller(path: str) -> int:
+    """How many times smaller the photos in such a folder are; 1 in other folders."""
+    found = COPIES.fullmatch(path.split("/")[0])
+    return int(found[1]) if found else 1
+
+
+def _of_copy(path: Path, file: Path, entry: PoseEntry) -> PoseEntry:
+    """The entry of a photo's smaller copy, whose lens is that of the photo itself where the file names no size."""
+    lens, below = entry.lens, path.is_relative_to(file.parent)
+    times = _times_smaller(path.relative_to(file.parent).as_posix()) if below else 1
+    if times == _times_smaller(_plain(entry.name)) or entry.size != (None, None) or not callable(lens):
+        return entry
+
+    def at_full_size(header: ImageHeader, name: str) -> FrameCamera:
+        full = lens(header._replace(width=header.width * times, height=header.height * times), name)
+        return full._replace(camera=full.camera.resized(header.width, header.height))
+
+    return replace(entry, lens=at_full_size)
 
 
 def _of_another_machine(name: str) -> bool:

@@ -59,6 +59,37 @@ def test_images_without_frame_are_left_out_and_said(tmp_path):
     assert any("004.jpg" in text for text in dataset.warnings)
 
 
+@pytest.mark.parametrize("declared", [True, False])
+@pytest.mark.parametrize("extension", ["", ".jpg"])
+def test_photos_that_are_there_in_smaller_copies_alone_are_read_with_their_lens_scaled(
+    tmp_path, declared, extension
+):
+    document = nerfstudio_scene(tmp_path)
+    for key, value in {
+        "w": 8 * WIDTH,
+        "h": 8 * HEIGHT,
+        "fl_x": 144.0,
+        "fl_y": 148.0,
+        "cx": 82.0,
+        "cy": 62.0,
+    }.items():
+        document[key] = value
+    if not declared:
+        del document["w"], document["h"]
+    for frame in document["frames"]:
+        frame["file_path"] = "./" + frame["file_path"].removesuffix(".jpg") + extension
+    (tmp_path / "images").rename(tmp_path / "images_8")
+    (tmp_path / "images_16").mkdir()
+    for path in (tmp_path / "images_8").iterdir():
+        Image.open(path).resize((WIDTH // 2, HEIGHT // 2)).save(tmp_path / "images_16" / path.name)
+    dataset = read_dataset(save(tmp_path, document))
+    assert [frame.path.parent.name for frame in dataset.frames] == ["images_8"] * 4
+    camera = dataset.cameras[0]
+    assert (camera.width, camera.height) == (WIDTH, HEIGHT)
+    assert camera.full()[:4] == pytest.approx((18.0, 18.5, 10.25, 7.75))
+    assert any("in a folder of smaller copies" in text for text in dataset.warnings)
+
+
 def test_masks_are_found_by_their_path_or_as_instant_ngp_names_them_which_means_the_opposite(tmp_path):
     document = nerfstudio_scene(tmp_path)
     for name in ("masks/000.png", "images/dynamic_mask_001.png", "images/dynamic_mask_000.png"):
