@@ -8,6 +8,9 @@ from pydantic import Field
 
 from biresnerf.frozen_model import FrozenModel
 
+# This variable is set where a fault of ours must end the run, and not leave it with less evidence: in tests.
+FAULTS_RAISE = "BIRESNERF_FAULTS_RAISE"
+
 
 class Fault(FrozenModel):
     """What is wrong and how to fix it, the same in an exception, in a job's error and in an HTTP answer."""

@@ -6,6 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from biresnerf.errors import Fault
 from biresnerf.frozen_model import FrozenModel
 from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.uncertainty import GeoReference, InputAccuracy, KnownScale, PoseUncertainty
@@ -297,3 +298,8 @@ class Report(FrozenModel):
     input_from_optimised: SimilarityReport
     points: PointsReport | None = None
     warnings: tuple[str, ...] = ()
+    faults: tuple[Fault, ...] = Field(
+        (),
+        description="What failed on our side: evidence is missing that the photos may hold, and no verdict is "
+        "`improved` without it.",
+    )

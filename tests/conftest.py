@@ -9,6 +9,7 @@ from collections import Counter
 
 import pytest
 
+from biresnerf.errors import FAULTS_RAISE
 from biresnerf.openmp import let_waiting_threads_sleep
 
 # A shell ignores Ctrl-C on behalf of what it runs in the background, and that is inherited. The processes that tests
@@ -17,6 +18,7 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 let_waiting_threads_sleep()
+os.environ[FAULTS_RAISE] = "1"  # no test must pass on the evidence that is left
 
 # A test that uses one of these fixtures, directly or not, needs what the marker says.
 MARKERS_OF_FIXTURES = {

@@ -7,6 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from biresnerf.data.model.refined_set import REFINED
+from biresnerf.data.seeding.colmap_process import LOG
 from biresnerf.data.show.history import HISTORY
 from biresnerf.data.show.view_file import CONTACT_SHEET, PREVIEW, THUMBNAIL, VIEW
 from biresnerf.errors import InputError
@@ -53,7 +54,7 @@ class OutputFolder:
             return
         written = {one.in_result for one in formats().values()}
         written |= {REPORT, REPORT_HTML, CONFIG, HISTORY, RENDERS, REFINED, THUMBNAIL, VIEW, CONTACT_SHEET}
-        written |= {GEOREFERENCE, CHECKPOINT.parent.name}
+        written |= {GEOREFERENCE, LOG, CHECKPOINT.parent.name}
         for name in {Path(file).parts[0] for file in written if file}:
             path = self.path / name
             if path.is_dir():
@@ -71,8 +72,13 @@ class OutputFolder:
         """Remove refined poses beside those of the result."""
         shutil.rmtree(self.path / REFINED, ignore_errors=True)
 
-    def clean_up(self) -> None:
-        """Remove what only an unfinished run needs, and what others could start from unless that is to be kept."""
+    def clean_up(self, *, failed: bool = False) -> None:
+        """Remove what only an unfinished run needs, and what others could start from unless that is to be kept.
+
+        What COLMAP said stays where something ``failed``.
+        """
+        if failed and (said := self.path / CHECKPOINT.with_name(LOG)).is_file():
+            said.replace(self.path / LOG)
         shutil.rmtree(self.preview, ignore_errors=True)
         if self._keep_reusable:
             (self.path / CHECKPOINT).unlink(missing_ok=True)

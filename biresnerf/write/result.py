@@ -95,7 +95,7 @@ def write_result(
     report = report.model_copy(update={"warnings": report.warnings + notes})
     write_text(path / REPORT, report.model_dump_json(indent=2))
     if complete:
-        folder.clean_up()
+        folder.clean_up(failed=bool(report.faults))
         stages.monitor.report_end(optimiser.schedule.steps)
     return report
 

@@ -35,6 +35,11 @@ _COUNTERS = {
         "Entries of jobs' histories: queued, started, succeeded …",
     ),
     "job_failures": ("biresnerf_job_failures", "code", "Failed jobs by the code of their error."),
+    "job_faults": (
+        "biresnerf_job_faults",
+        "code",
+        "Faults of ours that jobs went on without: evidence was missing.",
+    ),
     "job_requeues": ("biresnerf_job_requeues", "why", "Jobs given back; why=worker_lost is a take-over."),
     "webhook_attempts": ("biresnerf_webhook_attempts", "result", "Deliveries of webhook messages tried."),
     "stored_files": ("biresnerf_stored_files", "", "Files stored in datasets."),
@@ -51,6 +56,7 @@ _QUEUE = (
 _FROM_ZERO: dict[str, tuple[str, ...]] = {
     "job_events": get_args(EventType),
     "job_failures": ("engine_error", "timeout", "too_many_crashes"),
+    "job_faults": ("seeding_crashed",),
     "job_requeues": ("disk_full", "lost", "shutdown", "store_away", "worker_lost"),
     "webhook_attempts": ("delivered", "failed"),
 }

@@ -179,11 +179,17 @@ class Ledger:
         job: DictRow,
         artifacts: Sequence[Artifact],
         verdict: VerdictName | None,
+        faults: Sequence[str] = (),
     ) -> bool:
-        """Make the result the job's one result; False where a cancellation was asked for first."""
+        """Make the result the job's one result, and count faults by code.
+
+        False where a cancellation was asked for first.
+        """
         if job["cancel_requested"]:
             return False
         await connection.execute("UPDATE jobs SET verdict = %s WHERE id = %s", (verdict, job["id"]))
+        for code in faults:
+            await connection.execute("INSERT INTO tally_log (name, label) VALUES ('job_faults', %s)", (code,))
         await finish(connection, job["id"], "succeeded", None, artifacts)
         await trash_attempts(connection, job["id"], self._stall_s, self.claim.name)
         return True

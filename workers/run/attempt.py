@@ -17,7 +17,7 @@ from pydantic import ValidationError
 
 from biresnerf.options.refine_options import ResolvedOptions, parse_options
 from biresnerf.progress import Progress
-from biresnerf.report import Verdict, VerdictName
+from biresnerf.report import Report, VerdictName
 from biresnerf.wire.problems import JobError
 from workers.database.database import Database
 from workers.jobs.claim import Claim, Fenced
@@ -193,7 +193,7 @@ class Attempt:
     async def _conclude(self, status: int | None) -> Ending:
         if status == 0:
             artifacts = await self._store(enough=lambda: self._stop_reason == "cancel")
-            if await self._ledger.publish(artifacts, self._verdict()):
+            if await self._ledger.publish(artifacts, *self._reported_result()):
                 return Ending("succeeded")
             await self._ledger.cancelled(artifacts)
             return Ending("cancelled")
@@ -267,16 +267,17 @@ class Attempt:
         error = out_of_memory(self._claim.smaller, tail)
         return await self._fail(error, await self._store(log_only=True))
 
-    def _verdict(self) -> VerdictName | None:
-        """What the report says of the result; None where it passes no verdict."""
+    def _reported_result(self) -> tuple[VerdictName | None, tuple[str, ...]]:
+        """The report's verdict, None where it passes none, and the codes of its faults."""
         if self._claim.kind != "refine":
-            return None
+            return None, ()
         try:
-            passed = json.loads((self._output / "report.json").read_bytes()).get("verdict")
-            return None if passed is None else Verdict.model_validate(passed).verdict
+            report = Report.model_validate_json((self._output / "report.json").read_bytes())
         except (OSError, ValueError) as error:
             log.error("no verdict of %s: %s", self._claim.job_id, error)
-            return None
+            return None, ()
+        verdict = None if report.verdict is None else report.verdict.verdict
+        return verdict, tuple(fault.code for fault in report.faults)
 
     def _reported_error(self) -> JobError:
         """What the process wrote to ``error.json`` before it exited with 2 or 3."""

@@ -84,7 +84,8 @@ def refine_command(
 def summary(report: Report, output: Path) -> str:
     """The result in a few lines of text."""
     moved = sorted(image.moved_deg for image in report.images)
-    lines = report.verdict.in_words() if report.verdict is not None else []
+    lines = [f"FAILED: {fault}" for fault in report.faults]
+    lines += report.verdict.in_words() if report.verdict is not None else []
     lines += [
         f"{len(report.images)} cameras, moved by {moved[len(moved) // 2]:.3g} deg (median), {moved[-1]:.3g} deg (most)",
         f"{report.options.method}: {report.steps_done} steps"

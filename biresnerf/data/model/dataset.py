@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.model.colmap_scene import ColmapModel
+from biresnerf.errors import Fault
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.report import IntrinsicsSource, PoseSource
 
@@ -87,6 +88,7 @@ class Dataset:
         source: how the input was written.
         warnings: what the user should know about how it was read.
         intrinsics_sources: who found each camera's intrinsics; empty where the user gave them all.
+        faults: what failed on our side, so that evidence is missing that the photos may hold.
     """
 
     root: Path
@@ -95,6 +97,7 @@ class Dataset:
     source: SourceFormat
     warnings: tuple[str, ...] = ()
     intrinsics_sources: tuple[IntrinsicsSource, ...] = ()
+    faults: tuple[Fault, ...] = ()
 
     def __post_init__(self) -> None:
         if all(by == "given" for by in self.intrinsics_sources):

@@ -136,10 +136,15 @@ def drop_contradicting_pairs(database_path: Path, cam_from_world: dict[str, Any]
 
 
 def write_position_priors(database_path: Path, cam_from_world: dict[str, Any], deviation: float) -> None:
-    """Given camera centres as priors of this standard deviation."""
+    """Given camera centres as priors of this standard deviation, in the place of those that COLMAP read from EXIF.
+
+    Its GPS positions lie in another frame than given poses, and its gravity is only as good as the photographer's
+    hand: the tag that says which way is up knows quarter turns.
+    """
     import pycolmap
 
     database = pycolmap.Database.open(database_path)
+    database.clear_pose_priors()
     for image in database.read_all_images():
         if image.name not in cam_from_world:
             continue

@@ -73,8 +73,9 @@ def run_colmap(
                 child.wait()
     answer = Path(request["answer"])
     if child.returncode != 0 or not answer.is_file():
-        tail = log_path.read_text("utf-8", errors="replace").strip().splitlines()[-3:]
-        raise RefinementError("seeding_crashed", f"COLMAP ended with {child.returncode}: {' | '.join(tail)}")
+        said_last = log_path.read_text("utf-8", errors="replace").strip().splitlines()[-1:]
+        logger.info("COLMAP ended with %s: %s", child.returncode, "".join(said_last).replace(str(work), "…"))
+        raise _crashed(child.returncode)
     result: dict[str, Any] = json.loads(answer.read_text("utf-8"))
     return result
 
@@ -106,6 +107,20 @@ def _wait(
                 hint="Give fewer images, or approximate poses.",
             )
         time.sleep(_POLL_S)
+
+
+def _crashed(status: int) -> RefinementError:
+    if status == -signal.SIGKILL:
+        return RefinementError(
+            "seeding_crashed",
+            "COLMAP was killed while it looked for feature matches, most likely for want of memory.",
+            hint="Use fewer or smaller photos, or more memory.",
+        )
+    return RefinementError(
+        "seeding_crashed",
+        "COLMAP failed while it looked for feature matches. This is a fault of the program, not of the photos.",
+        hint=f"Please report it with {LOG} of the output folder. start=given refines given poses without matches.",
+    )
 
 
 def _keep(log_path: Path, folder: Path | None) -> None:

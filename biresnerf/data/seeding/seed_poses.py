@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
@@ -23,9 +25,11 @@ from biresnerf.data.seeding.match_poses import MatchedPoses, can_match, carry_mo
 from biresnerf.data.seeding.missing_poses import guess_missing
 from biresnerf.data.seeding.on_turntable import even_ring
 from biresnerf.data.seeding.seeding_progress import OnSeeding
-from biresnerf.errors import InputError, RefinementError
+from biresnerf.errors import FAULTS_RAISE, InputError, RefinementError
 from biresnerf.options.refine_options import SeedingEffort, StartPoses
 from biresnerf.report import PoseSource
+
+logger = logging.getLogger(__name__)
 
 LEAST_PLACED = 0.6  # of the images; a model of fewer says too little about a rig whose poses are given
 LEAST_REGISTERED = 0.4  # of images of which none has a pose; from fewer, the rest cannot be guessed
@@ -110,7 +114,8 @@ def seed_poses(
     Raises:
         InputError: ``pose_missing``, ``colmap_missing``, ``seed_failed``, ``insufficient_overlap`` or ``seed_timeout``.
         Interrupted: ``should_stop`` said so.
-        RefinementError: ``seeding_crashed``: COLMAP itself failed, and there are no given poses.
+        RefinementError: ``seeding_crashed``: COLMAP itself failed, and there are no given poses. Where there are,
+            the set that is returned has the fault.
     """
     given = _Given.of(dataset)
     if start == "given" or (start == "none" and given.posed.all()):
@@ -129,12 +134,17 @@ def seed_poses(
             else dataset,
             should_stop, seed, effort, limit_s, remember, on_progress,
         )  # fmt: skip
-    except (InputError, RefinementError) as error:
+    except InputError as error:
         if start == "colmap" or not given.posed.any():
             raise
         warning = f"The given poses could not be compared with feature matches: {error}"
         noted = replace(dataset, warnings=(*dataset.warnings, warning))
         return _seeding(noted, given.without_matches())
+    except RefinementError as error:
+        if start == "colmap" or not given.posed.any() or os.environ.get(FAULTS_RAISE):
+            raise
+        logger.error("%s The run goes on without feature matches.", error.fault)
+        return _seeding(replace(dataset, faults=(*dataset.faults, error.fault)), given.without_matches())
     if start == "auto" and given.posed.any():
         return _beside_given(given, mapping)
     return _from_scratch(given, mapping, start)

@@ -77,6 +77,7 @@ def run_report(
         threads=optimiser.threads,
         working_size=(int(scene.images.widths.max()), int(scene.images.heights.max())),
         input_from_optimised=refined.input_from_optimised.report(),
+        faults=dataset.faults,
         warnings=dataset.warnings
         + focal_warnings(dataset, refined.lenses)
         + turntable_warnings(scene.start)

@@ -35,6 +35,7 @@ class Findings:
     Attributes:
         failed: sentences on what is inconsistent; empty where all is well.
         moved_px: how far the image moved, at working size.
+        faults: sentences on what failed on our side.
         working_share: working size over the full size that `epipolar` is measured at.
         out_of_frame: a sentence if the refined poses fit the input's frame only roughly, else empty.
         compared_with: where the input's poses come from.
@@ -48,6 +49,7 @@ class Findings:
     compared_with: Literal["given", "seeded", "mixed"]
     grounded: bool
     out_of_frame: str = ""
+    faults: tuple[str, ...] = ()
     working_share: float = 1.0
 
     @property
@@ -101,7 +103,7 @@ def decide(findings: Findings) -> Verdict:
         verdict=name,
         returned="input" if keep else "refined",
         compared_with=findings.compared_with,
-        why=(ground, *_sentences(findings)),
+        why=(ground, *(fault for fault in findings.faults if fault not in ground), *_sentences(findings)),
         moved_px=findings.moved_px,
         heldout=findings.heldout,
         epipolar=findings.epipolar,
@@ -128,6 +130,8 @@ def _judge(f: Findings) -> tuple[VerdictName, str]:
             "inconclusive",
             "Neither the input's poses nor the refined ones agree with the feature matches.",
         )
+    if f.faults:
+        return "inconclusive", " ".join(f.faults)
     if speaks_for:
         return "improved", " ".join(
             filter(None, (f"The refined poses are better by {_named(speaks_for)}.", f.out_of_frame))

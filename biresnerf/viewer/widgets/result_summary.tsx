@@ -28,6 +28,15 @@ export function ResultSummary({ report, rows, cellOf, onSelect, actionsOf }: Res
   });
   return (
     <section class="verdict" aria-label="Verdict">
+      {(report.faults ?? []).length > 0 && (
+        <ul class="warnings faults" role="alert" aria-label="What failed">
+          {report.faults.map((fault) => (
+            <li key={fault.code}>
+              <strong>{fault.detail}</strong> {fault.hint}
+            </li>
+          ))}
+        </ul>
+      )}
       <VerdictSentence report={report} />
       <dl class="figures">
         {figuresOf(report, rows).map(({ name, value, note }) => (

@@ -18,11 +18,12 @@ from biresnerf.data.seeding.map_images import MappedModel
 from biresnerf.data.seeding.match_poses import carry_model
 from biresnerf.data.seeding.seed_poses import Seeding, seed_poses
 from biresnerf.data.synthetic.scene import synthetic_focal
-from biresnerf.errors import Interrupted, RefinementError
+from biresnerf.errors import FAULTS_RAISE, Interrupted, RefinementError
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import rotation_angle_deg, rotation_between_deg
 from biresnerf.geometry.similarity import Similarity, align_by_spread
+from tests.data.photos.geotagged import geotag
 from tests.data.scenes import plain_features, textured_arc
 
 pytestmark = pytest.mark.slow
@@ -30,6 +31,7 @@ pytestmark = pytest.mark.slow
 pytest.importorskip("pycolmap", reason="needs pycolmap (pip install 'biresnerf[colmap]')")
 VIEWS, SIZE = 10, 200
 MISSING, BLANK = (2, 6), 5
+ORIENTATION = 0x0112
 
 
 def with_poses(dataset: Dataset, poses: np.ndarray) -> Dataset:
@@ -239,11 +241,39 @@ def test_long_sequences_are_matched_along_their_names_and_where_photos_look_alik
     assert len(pairs) < 2 * VIEWS
 
 
-def test_a_failure_of_colmap_leaves_the_given_poses_and_is_told(noisy, monkeypatch):
+def test_a_failure_of_colmap_leaves_the_given_poses_and_a_fault(noisy, monkeypatch, caplog):
     def fail(*_, **__):
-        raise RefinementError("seeding_crashed", "COLMAP ended with -6: out of luck")
+        raise RefinementError("seeding_crashed", "COLMAP failed.", hint="Report it.")
 
     monkeypatch.setattr(remembered_mapping, "ask_colmap", fail)
+    with pytest.raises(RefinementError):
+        seed_poses(noisy)
+    monkeypatch.delenv(FAULTS_RAISE)
+    with pytest.raises(RefinementError):
+        seed_poses(noisy, "colmap")
     found = seed_poses(noisy)
     assert set(found.candidates[0].sources) == {"given"}
-    assert any("out of luck" in text for text in found.dataset.warnings)
+    assert [fault.code for fault in found.dataset.faults] == ["seeding_crashed"]
+    assert found.dataset.warnings == noisy.warnings
+    assert "COLMAP failed. Report it." in caplog.text
+
+
+@pytest.mark.parametrize("others", [0, 2])
+def test_what_cameras_write_into_photos_does_not_keep_given_poses_from_their_matches(
+    found, noisy, tmp_path, others
+):
+    """Of each photo with an Orientation or a GPS position COLMAP writes a prior of its own."""
+    frames = []
+    for i, frame in enumerate(noisy.frames):
+        path = tmp_path / f"{frame.path.stem}.jpg"
+        exif = geotag(48.0 + i, 11.0, 500.0)
+        exif[ORIENTATION] = 1
+        Image.open(frame.path).save(path, exif=exif, quality=97)
+        pose = None if i < others else frame.world_from_cam
+        frames.append(replace(frame, path=path, world_from_cam=pose))
+    written = seed_poses(replace(noisy, root=tmp_path, frames=tuple(frames)))
+    best, bare = written.candidates[1], found.candidates[1]
+    assert placed(best).all()
+    assert np.median(errors_deg(best.world_from_cam, noisy.world_from_cam)) == pytest.approx(
+        np.median(errors_deg(bare.world_from_cam, noisy.world_from_cam)), rel=0.2
+    )

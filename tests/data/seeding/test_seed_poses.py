@@ -167,13 +167,25 @@ def test_the_time_limit_ends_the_child(folder):
 
 
 @needs_colmap
-def test_a_crash_of_colmap_is_told_with_its_last_words(folder, monkeypatch, tmp_path):
+@pytest.mark.parametrize(
+    ("how", "said"), [("abort()", "fault of the program"), ("kill(os.getpid(), 9)", "memory")]
+)
+def test_a_crash_of_colmap_is_told_in_words_and_its_own_go_to_the_log(
+    folder, monkeypatch, tmp_path, caplog, how, said
+):
     broken = tmp_path / "colmap_child.py"
-    broken.write_text("import os, sys; print('out of luck', file=sys.stderr, flush=True); os.abort()")
+    broken.write_text(
+        f"import os, sys; print('{tmp_path}: out of luck', file=sys.stderr, flush=True); os.{how}"
+    )
     monkeypatch.setattr(colmap_process, "CHILD", broken)
-    with pytest.raises(RefinementError, match="out of luck") as caught:
+    caplog.set_level("INFO", logger=colmap_process.__name__)
+    with pytest.raises(RefinementError) as caught:
         seeded(folder)
     assert caught.value.code == "seeding_crashed"
+    assert said in caught.value.detail
+    assert caught.value.hint
+    assert "out of luck" not in str(caught.value)
+    assert "out of luck" in caplog.text
 
 
 def test_without_colmap_the_extra_is_named(folder, monkeypatch):

@@ -81,12 +81,19 @@ def findings(
         (findings(held_out(0.05), matched(1.0), out_of_frame="Far."), "failed_check", "input"),
         (findings(held_out(4.0), matched(-1.0), out_of_frame="Far."), "failed_check", "input"),
         (findings(held_out(4.0), matched(1.0, share=2 * FITS_BELOW)), "inconclusive", "input"),
+        (findings(held_out(4.0), faults=("COLMAP failed.",)), "inconclusive", "input"),
+        (findings(held_out(-4.0), faults=("COLMAP failed.",)), "kept_input", "input"),
     ],
 )
 def test_the_verdict_follows_from_the_evidence(told, verdict, returned):
     decided = decide(told)
     assert (decided.verdict, decided.returned) == (verdict, returned)
     assert decided.why
+
+
+@pytest.mark.parametrize("gain", [4.0, 0.05, -4.0])
+def test_a_fault_of_ours_is_named_whatever_the_verdict(gain):
+    assert "COLMAP failed." in " ".join(decide(findings(held_out(gain), faults=("COLMAP failed.",))).why)
 
 
 def test_matches_that_made_the_start_speak_against_refined_poses_but_not_for_them():

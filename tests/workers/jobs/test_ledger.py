@@ -134,8 +134,14 @@ async def test_what_got_through_though_its_answer_was_lost_is_written_once(
 
     monkeypatch.setattr(database, "transaction", loses_each_first_answer)
     await ledger.log(["one"])
-    assert await ledger.publish([FILE], "improved")
+    assert await ledger.publish([FILE], "improved", ["seeding_crashed"])
     monkeypatch.undo()
+    counted = [
+        (tally.label, tally.count)
+        for tally in (await stores.monitor.statistics()).tallies
+        if tally.name == "job_faults"
+    ]
+    assert counted == [("seeding_crashed", 1)]
     assert [line.text for line in await stores.jobs.log(ledger.claim.job_id)] == ["one"]
     assert (await events(stores, ledger)).count("succeeded") == 1
 
