@@ -16,12 +16,13 @@ from biresnerf.data.formats.bad_frames import attempt, good_frames
 from biresnerf.data.formats.bind_images import dataset_of
 from biresnerf.data.formats.colmap.read_model import model_file_formats, read_colmap_model
 from biresnerf.data.formats.parsed_poses import ParsedPoses, PoseEntry, without_problems
+from biresnerf.data.formats.transforms.dialects import plain_document
 from biresnerf.data.formats.transforms.find_photos import find_photos
 from biresnerf.data.formats.transforms.read_intrinsics import Fields, camera_of_frame
 from biresnerf.data.model.conventions import world_from_cam_of_file
 from biresnerf.data.model.dataset import Dataset, SourceFormat
 from biresnerf.data.model.pose_validation import ROTATION_WARNED, rigid_matrix
-from biresnerf.data.model.untrusted_file import invalid_file, read_json_object, refuse_non_finite
+from biresnerf.data.model.untrusted_file import invalid_file, refuse_non_finite
 from biresnerf.data.photos.masks import dynamic_mask, named_mask
 from biresnerf.data.photos.named_images import refuse_more_than_files, refuse_too_few
 from biresnerf.data.photos.photo_folders import unused_image_notes
@@ -53,7 +54,7 @@ def read_transforms(path: Path, within: Path | None = None) -> Dataset:
 
 def parse_transforms(_root: Path, path: Path) -> ParsedPoses:
     """Names and poses of the frames; a frame that names no image has an empty name. Raises InputError."""
-    document = read_json_object(path, apart="frames")
+    document, notes = plain_document(path)
     rows = _frame_objects(document, path.name)
     source = _source_format(document, path)
     entries: list[PoseEntry] = []
@@ -74,10 +75,9 @@ def parse_transforms(_root: Path, path: Path) -> ParsedPoses:
         lens = partial(camera_of_frame, Fields(row, source.document, path.name, index))
         size = _named_size(row, document)
         entries.append(PoseEntry(name, pose, where, lens, size, raw=row, problem=problem))
-    notes: tuple[str, ...] = ()
     if worst > ROTATION_WARNED:
-        notes = (f"rotations were made orthonormal; the worst was off by {worst:.1e} ({worst_name})",)
-    return ParsedPoses(source, tuple(entries), notes=notes)
+        notes.append(f"rotations were made orthonormal; the worst was off by {worst:.1e} ({worst_name})")
+    return ParsedPoses(source, tuple(entries), notes=tuple(notes))
 
 
 def bind_transforms(parsed: ParsedPoses, root: Path, within: Path | None = None) -> Dataset:
