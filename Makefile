@@ -19,7 +19,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Each process of the tests would compile all modules, and pytest rewrite all assertions, again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup web test test-fast test-kernels test-lowest coverage lint format demo serve bench docs docs-site notebooks screenshots fuzz promises audit sbom compose-check slurm-check consumers-check
+.PHONY: help setup web test test-fast test-kernels test-lowest coverage lint format demo serve bench field-check docs docs-site notebooks screenshots fuzz promises audit sbom compose-check slurm-check consumers-check
 .DELETE_ON_ERROR:
 
 help:  ## what there is
@@ -68,6 +68,9 @@ serve: web  ## the service on this machine
 
 bench: setup  ## the measurements; BENCH="arguments"
 	$(BIN)/python -m benchmarks $(BENCH)
+
+field-check: setup  ## the product on real sets from public repositories, cloned into BIRESNERF_FIELD_DATA (hours); FIELD="arguments"
+	$(BIN)/python -m benchmarks.field $(FIELD)
 
 docs: setup  ## write the generated pages, notebooks and schemas (docs/openapi.json) again
 	$(BIN)/python -m docs.generate

@@ -1,0 +1,168 @@
+"""One set through COLMAP and through the product, as people run them: by their commands."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from benchmarks.field.inputs import NOISE, Array, gps_places, gps_residual, photos_alone, with_poses
+from benchmarks.field.sets import FieldSet, lay_out
+from biresnerf.data.formats.read_dataset import read_poses
+from biresnerf.geometry.pose_error import pose_error
+
+Row = dict[str, Any]
+NICE = ("nice", "-n", "10")
+
+
+@dataclass(frozen=True)
+class Asked:
+    """How the battery runs: the folder of clones, photos of a set at most, options of the product, a service."""
+
+    data: Path
+    photos: int | None
+    options: tuple[str, ...]
+    url: str | None
+
+
+def run_set(field_set: FieldSet, asked: Asked) -> Row:
+    """A row of the table. What is done already, in the folder ``data``/work/NAME, is not done again."""
+    source, work = lay_out(field_set, asked.data), asked.data / "work" / field_set.name
+    names = field_set.photos[: asked.photos]
+    colmap = _placed_by_colmap(source, names, work / "colmap")
+    places = gps_places(source, names)
+    reference = colmap.get("reference", {})
+    truth = poses_of(reference.get("frames", []))
+    judge = Judge(truth, places, work / "colmap")
+    with Image.open(source / names[0]) as first:
+        size = first.size
+    row: Row = {
+        "set": field_set.name,
+        "kind": field_set.kind,
+        "photos": len(names),
+        "size": size,
+        "gps": len(places),
+        "date": time.strftime("%Y-%m-%d", time.gmtime()),
+    }
+    for name, model in colmap.items():
+        judged = judge.of(poses_of(model.get("frames", [])), work / "colmap" / name / "best")
+        row[name] = {key: value for key, value in model.items() if key != "frames"} | judged
+    given = {"alone": photos_alone(source, names, work / "alone")}
+    if truth:
+        folder = photos_alone(source, names, work / "noisy")
+        given["noisy"] = with_poses(folder, reference["frames"], noise=NOISE)
+        before = read_poses(folder / "transforms.json")
+        row["given"] = judge.of({Path(name).name: pose for name, pose in before.items()}, None)
+    if field_set.owner_poses:
+        given["owner"] = source
+    for name, folder in given.items():
+        row[name] = _refined(folder, work / f"{name}-out", asked, judge, None)
+    if asked.url is not None:
+        row["http"] = _refined(given.get("noisy", given["alone"]), work / "http-out", asked, judge, asked.url)
+    return row
+
+
+class Judge:
+    """Measures poses of a set against what is known of it.
+
+    Args:
+        truth: world_from_cam [4, 4] by file name.
+        places: from GPS, by file name.
+        matches: the folder of `colmap_child.place`.
+    """
+
+    def __init__(self, truth: dict[str, Array], places: dict[str, Array], matches: Path):
+        self._truth, self._places, self._matches = truth, places, matches
+
+    def of(self, poses: dict[str, Array], model: Path | None) -> Row:
+        """Errors (deg) after alignment and in the caller's frame, distance from GPS (m), misfit of matches (px)."""
+        row: Row = {"gps_m": gps_residual(poses, self._places)}
+        shared = sorted(self._truth.keys() & poses.keys())
+        if len(shared) > 2:
+            error = pose_error(
+                np.stack([poses[name] for name in shared]), np.stack([self._truth[name] for name in shared])
+            )
+            aligned = error.aligned_robust
+            row |= {
+                "deg": aligned.rotation_deg.mean,
+                "worst_deg": aligned.rotation_deg.max,
+                "centre_percent": aligned.centre_percent.mean,
+                "own_frame_deg": error.own_frame.rotation_deg.mean,
+            }
+        if model is not None:
+            row |= child(
+                "measure", self._matches, model=str(model), matches=str(self._matches / "matches.npz")
+            )
+        return row
+
+
+def child(step: str, work: Path, **request: Any) -> Row:
+    """What `colmap_child` answers."""
+    path, answer = work / f"{step}.request.json", work / f"{step}.json"
+    answer.unlink(missing_ok=True)
+    path.write_text(json.dumps({"step": step, "work": str(work), "answer": str(answer), **request}), "utf-8")
+    with (work / f"{step}.log").open("wb") as log:
+        command = [*NICE, sys.executable, "-m", "benchmarks.field.colmap_child", str(path)]
+        code = subprocess.run(command, stdout=log, stderr=log, check=False).returncode
+    if code != 0:
+        return {"error": f"COLMAP ended with {code}"}
+    found: Row = json.loads(answer.read_text("utf-8"))
+    return found
+
+
+def _placed_by_colmap(source: Path, names: tuple[str, ...], work: Path) -> Row:
+    done = work / "place.json"
+    if done.is_file() and json.loads((work / "place.request.json").read_text("utf-8"))["names"] == [*names]:
+        found: Row = json.loads(done.read_text("utf-8"))
+        return found
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir(parents=True)
+    return child("place", work, root=str(source), names=names)
+
+
+def poses_of(frames: list[Row]) -> dict[str, Array]:
+    """world_from_cam by file name."""
+    return {Path(frame["name"]).name: np.array(frame["world_from_cam"]) for frame in frames}
+
+
+def _refined(folder: Path, out: Path, asked: Asked, judge: Judge, url: str | None) -> Row:
+    """What the product makes of a folder by `refine`, or by `submit` where a service has the ``url``."""
+    shutil.rmtree(out, ignore_errors=True)
+    program = str(Path(sys.executable).with_name("biresnerf"))
+    where = ["submit", str(folder), "--url", url] if url else ["refine", str(folder)]
+    began = time.monotonic()
+    ended = subprocess.run(
+        [*NICE, program, *where, "-o", str(out), *asked.options, "--json"],
+        capture_output=True, text=True, check=False, env=os.environ,
+    )  # fmt: skip
+    row: Row = {"seconds": round(time.monotonic() - began), "code": ended.returncode}
+    report = out / "report.json"
+    if ended.returncode != 0 or not report.is_file():
+        return row | {"error": (ended.stderr or ended.stdout).strip()[-600:]}
+    found = json.loads(report.read_text("utf-8"))
+    poses = {Path(name).name: pose for name, pose in read_poses(out / "transforms.json").items()}
+    return row | said(found) | judge.of(poses, out / "colmap" / "sparse" / "0")
+
+
+def said(report: Row) -> Row:
+    """What a report tells the user of the poses."""
+    images = report["images"]
+    known = [image for image in images if (image["uncertainty"] or {}).get("rotation_deg") is not None]
+    return {
+        "images": len(images),
+        "placed": sum(image["pose_source"].startswith(("matches", "colmap")) for image in images),
+        "known": len(known),
+        "bound_deg": max((image["uncertainty"]["rotation_deg"] for image in known), default=None),
+        "verdict": (report["verdict"] or {}).get("verdict"),
+        "why": (report["verdict"] or {}).get("why", [])[:1],
+        "warnings": report["warnings"],
+    }
