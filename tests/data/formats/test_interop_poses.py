@@ -26,6 +26,7 @@ SETS = {
     "26_3d_scanner_app/chair": ("3d-scanner-app", 6, None, None),
     "27_nerfpp/scene": ("matrix-files", 8, 116.9192, "train/pose was read"),
     "27_nerfpp/train_alone": ("matrix-files", 8, 116.9192, None),
+    "29_other_poses_ignored/pose_csv": ("csv", 8, None, "poses.csv was read as camera to world"),
     "29_other_poses_ignored/realestate10k": ("realestate10k", 8, 116.9192, None),
     "31_neus2/transform_json": ("instant-ngp", 8, 116.9192, "from_na"),
     "31_neus2/transforms_json": ("instant-ngp", 8, 116.9192, "from_na"),
