@@ -111,8 +111,8 @@ def dataset_of(
     photos = read_photos(images, strict=strict)
     cameras: dict[tuple[Camera, IntrinsicsSource, int | None], int] = {}
     frames = []
-    for (path, entry), lens, orientation in zip(
-        photos.images, photos.lenses, photos.orientations, strict=True
+    for (path, entry), lens, orientation, levels in zip(
+        photos.images, photos.lenses, photos.orientations, photos.levels, strict=True
     ):
         index = cameras.setdefault((lens.camera, lens.source, entry.camera_id), len(cameras))
         mask, inverted = entry.mask or mask_beside(root, path, entry.name, within)
@@ -120,7 +120,7 @@ def dataset_of(
             Frame(
                 entry.name, path, index, entry.world_from_cam,
                 None if entry.world_from_cam is None else "given", entry.raw, mask=mask, mask_inverted=inverted,
-                orientation=orientation, timestamp_s=entry.timestamp_s,
+                orientation=orientation, timestamp_s=entry.timestamp_s, levels=levels,
             )
         )  # fmt: skip
     refuse_coinciding([frame.world_from_cam for frame in frames if frame.world_from_cam is not None], place)

@@ -12,6 +12,7 @@ from biresnerf.data.formats.parsed_poses import FrameCamera, PoseEntry
 from biresnerf.data.photos.guessed_lens import guess_lens, lens_doubts, refuse_other_units
 from biresnerf.data.photos.image_files import ImageHeader, read_header
 from biresnerf.data.photos.kinds.panorama import panorama
+from biresnerf.data.photos.kinds.sixteen_bit import Levels, levels_note, levels_of_set
 from biresnerf.data.photos.orientation import (
     meant_orientations,
     orientation_notes,
@@ -31,12 +32,14 @@ class PosedPhotos:
         images: file and entry of each.
         lenses: at the size of the file, as turned.
         orientations: EXIF orientation by which each is turned first.
+        levels: black and white of each, for those of 16 bits where the set's are not the full range.
         notes: for the user: what was left out, and what was done.
     """
 
     images: tuple[tuple[Path, PoseEntry], ...]
     lenses: tuple[FrameCamera, ...]
     orientations: tuple[int, ...]
+    levels: tuple[Levels | None, ...]
     notes: tuple[str, ...]
 
 
@@ -61,8 +64,13 @@ def read_photos(images: Sequence[tuple[Path, PoseEntry]], *, strict: bool) -> Po
     entries = [entry for _, entry in images]
     names = [entry.name for entry in entries]
     _refuse_mixed_sizes(found, entries)
-    notes = (*dropped, *more, *orientation_notes(stored, turns, names), *page_notes(stored, names))
-    return PosedPhotos(tuple(images), tuple(found), tuple(turns), notes)
+    deep = [path for (path, _), header in zip(images, stored, strict=True) if header.sixteen_bit]
+    levels = levels_of_set(deep) if deep else None
+    notes = [*dropped, *more, *orientation_notes(stored, turns, names), *page_notes(stored, names)]
+    if levels is not None:
+        notes.append(levels_note(levels, len(deep)))
+    each = tuple(levels if header.sixteen_bit else None for header in stored)
+    return PosedPhotos(tuple(images), tuple(found), tuple(turns), each, tuple(notes))
 
 
 def _declared_size(entry: PoseEntry) -> tuple[float | None, float | None]:

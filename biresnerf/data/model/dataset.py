@@ -36,6 +36,7 @@ class Frame:
             for the turned picture. 1 where they are for pixels as stored.
         mask_inverted: the mask means the opposite: pixels count where it is black (instant-ngp's dynamic_mask_*).
         timestamp_s: when it was taken, if a trajectory gave the time.
+        levels: black and white of a 16-bit photo of a set that uses a small part of them; None: the full range.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Frame:
     orientation: int = 1
     mask_inverted: bool = False
     timestamp_s: float | None = None
+    levels: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True, eq=False)

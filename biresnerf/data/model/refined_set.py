@@ -38,7 +38,7 @@ class RefinedImage:
         pose_source: who found the pose that the optimisation started from.
         flags: notable facts about it: ``fixed``, ``held_out``, ``repaired``, ...
         path: the file; None where it is not known.
-        orientation: as `biresnerf.data.model.dataset.Frame` has it.
+        orientation, levels: as `biresnerf.data.model.dataset.Frame` has them.
         uncertainty: of the pose; None where nothing was said of it.
     """
 
@@ -52,6 +52,7 @@ class RefinedImage:
     path: Path | None = None
     orientation: int = 1
     uncertainty: PoseUncertainty | None = None
+    levels: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,6 +141,7 @@ def refined_set(
             frame.path,
             frame.orientation,
             known[i],
+            frame.levels,
         )
         for i, (frame, file_name, pose) in enumerate(
             zip(dataset.frames, dataset.file_names, np.asarray(world_from_cam, np.float64), strict=True)

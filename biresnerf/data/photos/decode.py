@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from biresnerf.data.model.dataset import Frame
-from biresnerf.data.photos.image_files import DAMAGED, header_of, open_image
+from biresnerf.data.photos.image_files import DAMAGED, header_of, is_sixteen_bit, open_image
 from biresnerf.data.photos.kinds.linear_light import eight_bit
+from biresnerf.data.photos.kinds.sixteen_bit import as_eight_bit
 from biresnerf.data.photos.orientation import INVERSE, turned, turned_size
 from biresnerf.data.photos.shear import straightened
 from biresnerf.errors import InputError
@@ -23,6 +24,7 @@ _ALPHA_MODES = frozenset({"RGBA", "LA", "PA", "RGBa", "La"})
 def decode(frame: Frame, camera: Camera) -> NDArray[np.uint8]:
     """The frame's pixels, uint8 [h, w, 3] or [h, w, 4] (straight alpha); 16-bit and grey become 8-bit RGB.
 
+    Grey values of 16 bits lie between the set's black and white (`kinds.sixteen_bit`).
     Light as floating-point numbers becomes colours by the rule of `kinds.linear_light`, RAW photos by `kinds.raw_file`.
 
     Of several pages or frames in one file it is the first. Wide colour spaces are taken as they are.
@@ -43,7 +45,7 @@ def decode(frame: Frame, camera: Camera) -> NDArray[np.uint8]:
             )
         try:
             image.load()
-            stored = as_stored(_eight_bit(image, frame.name), image, header.orientation)
+            stored = as_stored(_eight_bit(image, frame), image, header.orientation)
             return straightened(turned(stored, frame.orientation), camera.shear)
         except DAMAGED:
             raise InputError(
@@ -59,18 +61,16 @@ def as_stored(picture: NDArray[T], image: Image.Image, orientation: int) -> NDAr
     return turned(picture, INVERSE[orientation]) if image.format == "TIFF" else picture
 
 
-def _eight_bit(image: Image.Image, name: str) -> NDArray[np.uint8]:
-    if image.mode.startswith("I;16") or (image.mode == "I" and image.format == "PNG"):
-        # 65535 becomes 255: the full range, rounded.
-        grey = ((np.asarray(image).astype(np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
-        return np.repeat(grey[..., None], 3, axis=2)
+def _eight_bit(image: Image.Image, frame: Frame) -> NDArray[np.uint8]:
+    if is_sixteen_bit(image):
+        return np.repeat(as_eight_bit(np.asarray(image), frame.levels)[..., None], 3, axis=2)
     if image.mode == "F":
-        return np.repeat(eight_bit(np.asarray(image)[..., None], name), 3, axis=2)
+        return np.repeat(eight_bit(np.asarray(image)[..., None], frame.name), 3, axis=2)
     if image.mode == "I":
         raise InputError(
             "image_format_unsupported",
             "holds 32-bit numbers, which are no colours.",
-            where=name,
+            where=frame.name,
             hint="Save it with 8 or 16 bits per channel.",
         )
     if image.mode in _ALPHA_MODES or "transparency" in image.info:

@@ -69,6 +69,7 @@ class ImageHeader(NamedTuple):
         focal_35mm: the focal length, mm, that sees as much on 35 mm film (36 x 24 mm).
         focal_plane: the sensor's resolution, which makes pixels of `focal_mm`.
         several: the file holds more pages or frames than the first one.
+        sixteen_bit: its values are grey ones of 16 bits.
         equirectangular: its XMP calls it a panorama of this projection.
     """
 
@@ -80,6 +81,7 @@ class ImageHeader(NamedTuple):
     focal_plane: FocalPlane | None = None
     several: bool = False
     equirectangular: bool = False
+    sixteen_bit: bool = False
 
 
 @contextmanager
@@ -204,7 +206,10 @@ def read_header(path: Path, name: str) -> ImageHeader:
 def header_of(image: Image.Image) -> ImageHeader:
     """Size, EXIF orientation and focal length of an opened image that is not decoded yet."""
     header = ImageHeader(
-        *stored_size(image), several=_holds_several(image), equirectangular=says_equirectangular(image)
+        *stored_size(image),
+        several=_holds_several(image),
+        equirectangular=says_equirectangular(image),
+        sixteen_bit=is_sixteen_bit(image),
     )
     return from_exif(image, lambda exif: _with_exif(header, exif)) or header
 
@@ -225,6 +230,11 @@ def stored_size(image: Image.Image) -> tuple[int, int]:
     if isinstance(image, TiffImageFile):
         return int(image.tag_v2[_TIFF_WIDTH]), int(image.tag_v2[_TIFF_HEIGHT])
     return image.size
+
+
+def is_sixteen_bit(image: Image.Image) -> bool:
+    """Whether an opened image is a grey one of 16 bits."""
+    return image.mode.startswith("I;16") or (image.mode == "I" and image.format == "PNG")
 
 
 def _holds_several(image: Image.Image) -> bool:

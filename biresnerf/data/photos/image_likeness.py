@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.area_resize import area_resize
-from biresnerf.data.photos.image_files import open_image, quiet_pillow
+from biresnerf.data.photos.image_files import is_sixteen_bit, open_image, quiet_pillow
+from biresnerf.data.photos.kinds.sixteen_bit import as_eight_bit
 
 SIDE = 24  # px that photos are shrunk to
 _DRAFT = 8 * SIDE  # px that a JPEG is decoded at
@@ -33,7 +34,7 @@ def likeness(dataset: Dataset) -> NDArray[np.float32]:
 
 
 def thumbnails(dataset: Dataset, indices: Sequence[int]) -> NDArray[np.float32]:
-    """Photos in grey, shrunk to 24 x 24 px [n, 24, 24], as bright as they are stored (to 255 or 65535).
+    """Photos in grey, shrunk to 24 x 24 px [n, 24, 24], as bright as they are decoded, to 255.
 
     Raises `InputError` as `open_image` does.
     """
@@ -45,8 +46,11 @@ def _thumbnail(dataset: Dataset, index: int) -> NDArray[np.float32]:
     frame = dataset.frames[index]
     with open_image(frame.path, frame.name) as image:
         image.draft("L", (_DRAFT, _DRAFT))
-        wide = image.mode.startswith(("I", "F"))  # 16 bit: Pillow would clip them
-        grey = np.asarray(image if wide else image.convert("L"), dtype=np.float32)
+        if is_sixteen_bit(image):
+            grey = as_eight_bit(np.asarray(image), frame.levels).astype(np.float32)
+        else:
+            wide = image.mode.startswith(("I", "F"))  # Pillow would clip them
+            grey = np.asarray(image if wide else image.convert("L"), dtype=np.float32)
     side_y, side_x = min(SIDE, grey.shape[0]), min(SIDE, grey.shape[1])
     small = area_resize(grey[..., None], side_x, side_y)[..., 0]
     padded = np.full((SIDE, SIDE), small.mean(), dtype=np.float32)

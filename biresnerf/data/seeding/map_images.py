@@ -162,7 +162,7 @@ def _numbered(dataset: Dataset) -> list[str]:
 def _as_it_is(dataset: Dataset, index: int) -> bool:
     """Whether COLMAP takes the file itself: it reads plain photos, and takes their pixels as they are stored."""
     frame = dataset.frames[index]
-    stored = frame.orientation == 1 and not dataset.camera_of(index).shear
+    stored = frame.orientation == 1 and not dataset.camera_of(index).shear and frame.levels is None
     return stored and is_plain(frame.path, frame.name)
 
 

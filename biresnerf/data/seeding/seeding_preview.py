@@ -15,7 +15,8 @@ from biresnerf.data.model.atomic_file import whole_file, write_text
 from biresnerf.data.model.dataset import Dataset, Frame
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.photos.decode import as_stored
-from biresnerf.data.photos.image_files import DAMAGED, header_of, open_image, quiet_pillow
+from biresnerf.data.photos.image_files import DAMAGED, header_of, is_sixteen_bit, open_image, quiet_pillow
+from biresnerf.data.photos.kinds.sixteen_bit import as_eight_bit
 from biresnerf.data.photos.orientation import turned
 from biresnerf.data.seeding.seeding_progress import SeedingProgress
 from biresnerf.errors import InputError
@@ -96,7 +97,9 @@ def _tile(frame: Frame) -> Image.Image:
     with open_image(frame.path, frame.name) as image:
         image.draft("RGB", (2 * TILE, 2 * TILE))  # a JPEG is decoded no larger than needed
         picture: Image.Image = image
-        if image.mode.startswith(("I", "F")):  # 16 bit: Pillow would clip them
+        if is_sixteen_bit(image):
+            picture = Image.fromarray(as_eight_bit(np.asarray(image), frame.levels))
+        elif image.mode.startswith(("I", "F")):  # Pillow would clip them
             grey = np.asarray(image, dtype=np.float32)
             picture = Image.fromarray((grey * (255 / max(1.0, float(grey.max())))).astype(np.uint8))
         picture = picture.convert("RGBA")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from biresnerf.data.formats.read_dataset import read_dataset
+from biresnerf.data.photos.images import load_images
 from biresnerf.errors import InputError
 from tests.data.test_real_sets import ROOT
 
@@ -40,6 +41,13 @@ REFUSED = {
     "33_focal_in_other_units/normalised": ("intrinsics_invalid", "looks like a share of the photo's width"),
     "45_unread_kinds_in_images/jp2": ("no_images", "4 JPEG 2000 (images/0001.jp2"),
 }
+
+
+def test_photos_of_low_contrast_in_16_bits_show_as_much_as_the_same_in_8():
+    dataset = read_dataset(CASES / "51_low_contrast_16bit/thermal")
+    images = load_images(dataset)
+    assert min(len(np.unique(images.image(index))) for index in range(len(dataset))) > 150
+    assert any("16 bits and use those from 29126 to 30296" in text for text in dataset.warnings)
 
 
 @pytest.mark.parametrize("name", READ)

@@ -178,7 +178,7 @@ def _write_photo(image: RefinedImage, old: Camera, new: Camera, path: Path) -> N
         with whole_file(path) as temporary:
             shutil.copyfile(image.path, temporary)
         return
-    frame = Frame(image.name, image.path, 0, None, None, orientation=image.orientation)
+    frame = Frame(image.name, image.path, 0, None, None, orientation=image.orientation, levels=image.levels)
     picture = decode(frame, old)
     flat = picture if same else undistorted(picture, old, new)
     with whole_file(path) as temporary:
