@@ -39,7 +39,7 @@ def test_an_adjustment_of_cameras_and_lenses_compiles_nothing_more():
     start = disturbed(plane.truth, rng, 0.004, 0.004)
     points = np.column_stack([rng.uniform(-0.5, 0.5, (80, 2)), np.zeros(80)])
     seen = observed(plane.truth, points, plane.intrinsics, rng, noise_px=0.1)
-    lenses = Lenses(np.zeros(9, np.int64), np.zeros((1, 3)), np.array([[0.1, 0.0, 0.0]]))
+    lenses = Lenses(np.zeros(9, np.int64), np.zeros((1, 8)), np.array([[0.1] + [0.0] * 7]))
     evidence = Evidence(plane.intrinsics, seen, plane.evidence(start).patches, lenses)
     found = adjust_poses(start, evidence, PosePrior.equal(start, 0.02, 0.06))
     misfit(found.world_from_cam, evidence, NoiseLevels())

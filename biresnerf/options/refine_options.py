@@ -104,8 +104,8 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
     )
     refine_intrinsics: Annotated[RefineIntrinsics, Option("coarse", "Lens", level="main")] = Field(
         "auto",
-        description="What to refine of focal length and distortion. auto: lenses that were not given; all: every lens, "
-        "and without feature matches the principal point as well.",
+        description="What to refine of focal length, principal point and distortion. auto: lenses that were not given; "
+        "all: every lens.",
     )
     input_rotation_deg: Annotated[float, Option("fine", "Accuracy of given rotations")] = Field(
         0.0,

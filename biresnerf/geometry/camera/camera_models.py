@@ -33,7 +33,9 @@ MODEL_PARAMETERS: dict[str, tuple[str, ...]] = {
 }
 MODEL_IDS = {name: number for number, name in enumerate(COLMAP_MODELS) if name in MODEL_PARAMETERS}
 FISHEYE_MODELS = frozenset(name for name in MODEL_PARAMETERS if name.endswith("FISHEYE"))
-# If the requested model cannot represent a camera, the first of these that can is used.
+# If the requested model cannot represent a camera, the first of these that can is used; those of one focal length where
+# the requested one has one.
+_ONE_FOCAL = ("SIMPLE_RADIAL", "RADIAL", "RADIAL_FISHEYE")
 _FALLBACKS = ("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
 
 
@@ -90,7 +92,9 @@ def smallest_model(full: FullParameters, preferred: str | None) -> tuple[str, tu
     Raises:
         ValueError: no model does: a fisheye with p1, p2, k5 or k6.
     """
-    order = _FALLBACKS if preferred is None else (preferred, *_FALLBACKS)
+    order: tuple[str, ...] = _FALLBACKS
+    if preferred is not None:
+        order = (preferred, *(_ONE_FOCAL if "f" in MODEL_PARAMETERS[preferred] else ()), *_FALLBACKS)
     model = next((name for name in order if _holds(name, full)), None)
     if model is None:
         raise ValueError("no camera model holds a fisheye lens with p1, p2, k5 or k6")

@@ -12,7 +12,14 @@ from biresnerf.geometry.similarity import align_by_spread
 from biresnerf.refinement.adjustment.cameras import POSE, Cameras
 from biresnerf.refinement.adjustment.evidence import Evidence, NoiseLevels, PosePrior
 from biresnerf.refinement.adjustment.kernels.patches import UNSEEN
-from biresnerf.refinement.adjustment.lens.lenses import LENS, OBSERVABLE, Lenses, LensEstimate, posterior
+from biresnerf.refinement.adjustment.lens.lenses import (
+    KINDS,
+    LENS,
+    OBSERVABLE,
+    Lenses,
+    LensEstimate,
+    posterior,
+)
 from biresnerf.refinement.adjustment.patch_term import PatchTerm
 from biresnerf.refinement.adjustment.solver.covariance import covariance, of_each, without_lenses
 from biresnerf.refinement.adjustment.solver.solve import Prior, minimise, normal_equations
@@ -108,7 +115,8 @@ def adjust_poses(
     if not unknown.any():
         return found
     # The parameters are given up one kind at a time: without the last, the evidence may tell of the others.
-    given_up = unknown & (np.arange(LENS) == np.flatnonzero(unknown.any(0)).max())
+    last = next(kind for kind in reversed(KINDS) if unknown[:, kind].any())
+    given_up = unknown & np.isin(np.arange(LENS), last)
     again = adjust_poses(world_from_cam, replace(evidence, lenses=lenses.held(given_up)), prior)
     if again.lenses is None:
         return again

@@ -121,7 +121,9 @@ class PatchTerm:
         def linearised(part: tuple[slice, Seen]) -> tuple[Array, Array, tuple[Array, ...]]:
             taken, seen = part
             system, right = np.zeros((size, size)), np.zeros(size)
-            back = patch_system(*seen, rows[0][taken], rows[1], *fixed, system, right, of_target)
+            back = patch_system(
+                *seen, rows[0][taken], rows[1], cameras.kinds, *fixed, system, right, of_target
+            )
             return system, right, back
 
         parts = self._in_parts(linearised, cameras, self.unknowns)

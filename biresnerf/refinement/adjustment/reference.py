@@ -13,27 +13,38 @@ def moved(rotation: Tensor, centre: Tensor, motion: Tensor) -> tuple[Tensor, Ten
     return so3_exp(motion[:, :3]) @ rotation, centre + motion[:, 3:]
 
 
+def bent(slopes: Tensor, k1: Tensor, k2: Tensor, p1: Tensor, p2: Tensor) -> Tensor:
+    """Slopes [..., 2] after distortion."""
+    x, y = slopes[..., :1], slopes[..., 1:]
+    s = x**2 + y**2
+    radial = 1 + s * (k1 + s * k2)
+    u = x * radial + 2 * p1 * x * y + p2 * (s + 2 * x**2)
+    v = y * radial + p1 * (s + 2 * y**2) + 2 * p2 * x * y
+    return torch.cat([u, v], -1)
+
+
 def in_pixels(lens: Tensor, in_cam: Tensor) -> Tensor:
-    """Pixel positions [..., 2] of points [..., 3] in camera axes; lens [..., 6] is fx, fy, cx, cy, k1, k2."""
-    slopes = in_cam[..., :2] / in_cam[..., 2:]
-    square = (slopes**2).sum(-1, keepdim=True)
-    radial = 1 + square * (lens[..., 4:5] + square * lens[..., 5:6])
-    return lens[..., :2] * radial * slopes + lens[..., 2:4]
+    """Pixel positions [..., 2] of points [..., 3] in camera axes; lens [..., 8] is fx, fy, cx, cy, k1, k2, p1, p2."""
+    slopes = bent(in_cam[..., :2] / in_cam[..., 2:], *lens[..., 4:].split(1, -1))
+    return lens[..., :2] * slopes + lens[..., 2:4]
 
 
 def with_lens(rows: Tensor, correction: Tensor) -> Tensor:
-    """Lenses [..., 6] from pinholes [..., 4] and corrections [..., 3]: log focal length, k1, k2."""
-    focal = rows[..., :2] * correction[..., :1].exp()
-    return torch.cat([focal, rows[..., 2:4], correction[..., 1:]], -1)
+    """Lenses [..., 8] from pinholes [..., 4] and corrections [..., 8], see `lens.lenses`."""
+    centre = rows[..., 2:4] + rows[..., :2] * correction[..., 3:5]
+    return torch.cat([rows[..., :2] * _longer(correction), centre, correction[..., [1, 2, 5, 6]]], -1)
+
+
+def _longer(correction: Tensor) -> Tensor:
+    return torch.stack([correction[..., 0], correction[..., 0] + correction[..., 7]], -1).exp()
 
 
 def seen_by(rays: Tensor, correction: Tensor) -> Tensor:
-    """Rays [..., 3] (z = 1) of pixels with a correction [3] of the lens, from those without; by fixed point."""
-    slopes = rays[..., :2]
-    found = slopes
+    """Rays [..., 3] (z = 1) of pixels with a correction [8] of the lens, from those without; by fixed point."""
+    aim = (rays[..., :2] - correction[3:5]) / _longer(correction)
+    found = aim
     for _ in range(100):
-        square = (found**2).sum(-1, keepdim=True)
-        found = slopes / (correction[0].exp() * (1 + square * (correction[1] + square * correction[2])))
+        found = found + aim - bent(found, *correction[[1, 2, 5, 6]])
     return torch.cat([found, rays[..., 2:]], -1)
 
 

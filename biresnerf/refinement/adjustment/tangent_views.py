@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from biresnerf.geometry.camera.camera import Intrinsics, project
-from biresnerf.refinement.adjustment.cameras import Cameras
+from biresnerf.refinement.adjustment.cameras import LENS_ROW, Cameras
 
 Array = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ class TangentViews:
         of: int64 [m], the photo of each observation.
         cam_from_view: [m, 3, 3].
         fisheye: bool [m].
-        lens: [m, 7], of the fisheyes' views, as the kernels take them.
+        lens: [m, 11], of the fisheyes' views, as the kernels take them.
         xy: [m, 2], the observations in their views, px.
     """
 
@@ -47,17 +47,17 @@ class TangentViews:
             near: [n], of each photo the least depth at which something is in front.
         """
         fisheye = intrinsics.fisheye.numpy()[image]
-        turn, lens = np.tile(np.eye(3), (len(image), 1, 1)), np.zeros((len(image), 7))
+        turn, lens = np.tile(np.eye(3), (len(image), 1, 1)), np.zeros((len(image), LENS_ROW))
         turn[fisheye] = _away_and_around(rays[fisheye])
         lens[fisheye, :2] = _scales(turn[fisheye], image[fisheye], intrinsics)
         lens[:, 4] = near[image]
         return cls(image, turn, fisheye, lens, np.where(fisheye[:, None], 0.0, xy))
 
     def seen(self, cameras: Cameras, lens: Array) -> tuple[Array, Array, Array, NDArray[np.int64]]:
-        """The views' rotations [m, 3, 3], centres [m, 3], lenses [m, 7] and numbers [m].
+        """The views' rotations [m, 3, 3], centres [m, 3], lenses [m, 11] and numbers [m].
 
         Args:
-            lens: of the photos [n, 7].
+            lens: of the photos [n, 11].
         """
         lenses = np.where(self.fisheye[:, None], self.lens, lens[self.of])
         rotation = cameras.rotation[self.of] @ self.cam_from_view

@@ -105,12 +105,12 @@ class TrackTerm:
 
     def linearise(self, cameras: Cameras, damping: float) -> Linearised:
         size, rows = cameras.unknowns, cameras.rows(self.image)
-        mixed = np.zeros((*rows.shape, 3))
+        mixed, fixed = np.zeros((*rows.shape, 3)), (self.noise_px, ROBUST_SCALE, damping)
 
         def linearised(points: slice) -> tuple[Array, Array, tuple[Array, Array]]:
             system, right = np.zeros((size, size)), np.zeros(size)
             seen = self._seen(cameras, self.unknowns, points)
-            back = track_system(*seen, rows, self.noise_px, ROBUST_SCALE, damping, system, right, mixed)
+            back = track_system(*seen, rows, cameras.kinds, *fixed, system, right, mixed)
             return system, right, back
 
         parts = in_parts(linearised, len(self.unknowns))

@@ -26,6 +26,7 @@ from biresnerf.refinement.finish.expected_errors import expected_errors
 from biresnerf.refinement.finish.gather_evidence import SplitEvidence, gather_evidence
 from biresnerf.refinement.finish.given_poses import input_accuracy
 from biresnerf.refinement.finish.lens_evidence import contradicted_focals, focal_certainty, given_focals
+from biresnerf.refinement.finish.lens_model import supported_lenses
 from biresnerf.refinement.finish.outcome import Finish, fit_of, heeded, most_heeded
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.scene.scene import Scene
@@ -52,6 +53,9 @@ def choose_poses(
     if not np.isfinite(refined).all():
         return None
     prior = PosePrior.equal(refined, PRIOR, PRIOR * optimiser.frame.distance, optimiser.bodies)
+    cameras = optimiser.lenses.refined(scene.dataset).cameras
+    lenses = supported_lenses(refined, split.fitted, split.left_out, prior, cameras, announce)
+    split = replace(split, fitted=replace(split.fitted, lenses=lenses))
     results = adjust(refined, split.fitted, prior, announce)
     noise = results["adjusted-tracks"].noise if "adjusted-tracks" in results else NoiseLevels()
     if noise.track_px > _most_noise_px(split.fitted):
@@ -63,7 +67,6 @@ def choose_poses(
         prior = given.prior(prior)
         patched = results.get("adjusted-patches")
         results = adjust(refined, split.fitted, prior, announce, patched.halves if patched else None)
-    cameras = optimiser.lenses.refined(scene.dataset).cameras
     adjusted = [as_candidate(name, each, split.fitted, cameras) for name, each in results.items()]
     found = [Candidate("refined", refined), *without_adjustment(scene, refined, optimiser.bodies)]
     candidates = sorted([*found, *filter(None, adjusted)], key=lambda candidate: ORDER.index(candidate.name))

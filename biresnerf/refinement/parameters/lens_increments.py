@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS, Camera, FullParameters
+from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS, Camera, FullParameters, smallest_model
 
 RefinedPart = Literal["none", "focal", "all"]
 
@@ -48,7 +48,7 @@ def units(camera: Camera) -> Tensor:
 
 
 def moved_camera(camera: Camera, increments: Tensor, unit: Tensor) -> Camera:
-    """A camera with increments [COLUMNS], in the same model."""
+    """A camera with increments [COLUMNS], in the same model where that has a place for all of them."""
     p, q = camera.full(), increments
     above_below_tangential = (q[DISTORTION] * unit).tolist()
     places = range(4) if p.fisheye else (0, 1, 2, 4, 5, 6, 7, 8)
@@ -62,8 +62,8 @@ def moved_camera(camera: Camera, increments: Tensor, unit: Tensor) -> Camera:
         cy=p.cy + float(q[3]) * p.fy,
         **coefficients,
     )
-    values = moved._asdict() | {"f": moved.fx}
-    return replace(camera, params=tuple(values[name] for name in MODEL_PARAMETERS[camera.model]))
+    model, params = smallest_model(moved, camera.model)
+    return replace(camera, model=model, params=params)
 
 
 def increments_between(before: Camera, after: Camera, unit: Tensor) -> Tensor:

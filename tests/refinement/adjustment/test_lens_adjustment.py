@@ -12,7 +12,7 @@ from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.refinement.adjustment import reference
 from biresnerf.refinement.adjustment.adjustment import adjust_poses, misfit
 from biresnerf.refinement.adjustment.evidence import Evidence, NoiseLevels, PosePrior
-from biresnerf.refinement.adjustment.lens.lenses import OBSERVABLE, Lenses, narrowing
+from biresnerf.refinement.adjustment.lens.lenses import LENS, OBSERVABLE, Lenses, slopes_seen
 from tests.refinement.adjustment.rig import FOCAL, SIZE, disturbed, observed, ring, rotation_errors_deg
 
 
@@ -21,15 +21,18 @@ def generator():
     return np.random.default_rng(7)
 
 
-def lens(count, *, focal=1.0, k1=0.0, k2=0.0):
-    camera = Camera("RADIAL", SIZE, SIZE, (FOCAL * focal, SIZE / 2, SIZE / 2, k1, k2))
+def lens(count, *, focal=1.0, k1=0.0, k2=0.0, centre=(0.0, 0.0), p1=0.0, p2=0.0, aspect=1.0):
+    """The principal point is off the middle by `centre` px."""
+    x, y = SIZE / 2 + centre[0], SIZE / 2 + centre[1]
+    camera = Camera("OPENCV", SIZE, SIZE, (FOCAL * focal, FOCAL * focal * aspect, x, y, k1, k2, p1, p2))
     return Intrinsics.from_cameras([camera] * count)
 
 
-def unknown(count, *, focal=0.1, radial=1.0, shared=True):
+def unknown(count, *, focal=0.1, radial=1.0, centre=0.0, tangential=0.0, aspect=0.0, shared=True):
     of_image = np.zeros(count, np.int64) if shared else np.arange(count)
     rows = 1 if shared else count
-    return Lenses(of_image, np.zeros((rows, 3)), np.tile([focal, radial, radial], (rows, 1)))
+    deviation = [focal, radial, radial, centre, centre, tangential, tangential, aspect]
+    return Lenses(of_image, np.zeros((rows, LENS)), np.tile(deviation, (rows, 1)))
 
 
 def scene(rng, true_lens, *, cameras=10, points=300, noise_px=0.3, poses=None):
@@ -47,9 +50,9 @@ def test_a_wrong_lens_is_found_within_its_deviation(rng):
     truth, evidence = scene(rng, lens(10, focal=1 / 1.05, k1=0.06, k2=-0.2))
     start = disturbed(truth, rng, 0.01, 0.04)
     found = adjust_poses(start, replace(evidence, lenses=unknown(10)), loose(start))
-    error = np.abs(found.lenses.correction - [[np.log(1 / 1.05), 0.06, -0.2]])
-    assert found.lenses.observable.all()
-    assert (error < 3 * found.lenses.deviation).all()
+    error = np.abs(found.lenses.correction - [[np.log(1 / 1.05), 0.06, -0.2, *(0.0,) * 5]])
+    assert found.lenses.observable[:, :3].all()
+    assert (error < 3 * found.lenses.deviation)[:, :3].all()
     assert error[0, 0] < 0.005
     held = adjust_poses(start, evidence, loose(start))
     errors = [rotation_errors_deg(each.world_from_cam, truth).mean() for each in (found, held)]
@@ -61,7 +64,7 @@ def test_a_right_lens_stays(rng):
     truth, evidence = scene(rng, lens(10))
     start = disturbed(truth, rng, 0.01, 0.04)
     found = adjust_poses(start, replace(evidence, lenses=unknown(10)), loose(start)).lenses
-    assert (np.abs(found.correction) < 3 * found.deviation).all()
+    assert (np.abs(found.correction) < 3 * found.deviation)[:, :3].all()
 
 
 def test_deviations_are_the_scatter_over_repeated_noise():
@@ -99,9 +102,9 @@ def test_a_parameter_is_given_up_alone(rng):
     found = adjust_poses(
         truth, replace(evidence, lenses=unknown(10, focal=0.3, radial=0.01)), loose(truth)
     ).lenses
-    assert found.observable.tolist() == [[True, False, False]]
+    assert found.observable.tolist() == [[True, *(False,) * 7]]
     assert found.correction[0, 0] == pytest.approx(np.log(1.03), abs=3 * found.deviation[0, 0])
-    assert np.isfinite(found.deviation).all()
+    assert np.isfinite(found.deviation[:, :3]).all()
 
 
 def test_each_image_may_have_a_lens_of_its_own(rng):
@@ -137,23 +140,48 @@ def test_poor_evidence_ends_in_finite_lenses(rng, kind, deviation):
 
 def test_left_out_tracks_tell_the_right_lens_from_a_wrong_one(rng):
     truth, evidence = scene(rng, lens(10, focal=0.97))
-    right = Lenses(np.zeros(10, np.int64), np.array([[np.log(0.97), 0, 0]]), np.zeros((1, 3)))
+    right = Lenses(np.zeros(10, np.int64), np.array([[np.log(0.97), *(0.0,) * 7]]), np.zeros((1, LENS)))
     noise = NoiseLevels(track_px=0.3)
     assert (misfit(truth, replace(evidence, lenses=right), noise) < misfit(truth, evidence, noise)).all()
 
 
+def test_all_of_a_lens_is_found_within_its_deviation(rng):
+    truth, evidence = scene(
+        rng, lens(12, focal=1.03, k1=0.05, k2=-0.1, centre=(15, -9), p1=0.004, p2=-0.006, aspect=1.004),
+        cameras=12, points=600, noise_px=0.05,
+    )  # fmt: skip
+    start = disturbed(truth, rng, 0.01, 0.04)
+    free = unknown(12, centre=0.05, tangential=0.05, aspect=0.02)
+    found = adjust_poses(start, replace(evidence, lenses=free), loose(start))
+    true = np.array([np.log(1.03), 0.05, -0.1, 15 / FOCAL, -9 / FOCAL, 0.004, -0.006, np.log(1.004)])
+    assert found.lenses.observable.all()
+    assert (np.abs(found.lenses.correction[0] - true) < 3 * found.lenses.deviation[0]).all()
+    assert rotation_errors_deg(found.world_from_cam, truth).mean() < 0.1
+
+
+def test_a_principal_point_off_the_middle_turns_all_cameras_alike_unless_it_is_found(rng):
+    truth, evidence = scene(rng, lens(12, centre=(6, -5)), cameras=12, points=600, noise_px=0.05)
+    held, freed = (
+        adjust_poses(truth, replace(evidence, lenses=unknown(12, centre=centre)), loose(truth))
+        for centre in (0.0, 0.03)
+    )
+    errors = [rotation_errors_deg(each.world_from_cam, truth).mean() for each in (held, freed)]
+    assert errors[0] > 0.5
+    assert errors[1] < 0.1 * errors[0]
+
+
 def test_rays_of_a_corrected_lens_are_those_of_the_fixed_point(rng):
     rays = np.concatenate([rng.uniform(-0.5, 0.5, (20, 2)), np.ones((20, 1))], 1)
-    correction = np.array([0.05, 0.1, -0.08])
+    correction = np.array([0.05, 0.1, -0.08, 0.01, -0.02, 0.004, -0.003, 0.01])
     exact = reference.seen_by(torch.from_numpy(rays), torch.from_numpy(correction))[:, :2].numpy()
-    np.testing.assert_allclose(rays[:, :2] * narrowing(correction, rays[:, :2]), exact, atol=1e-12)
+    np.testing.assert_allclose(slopes_seen(correction, rays[:, :2]), exact, atol=1e-12)
 
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("k1", [-1e3, -5.0, 0.0, 5.0, 1e3])
 @pytest.mark.parametrize("k2", [-1e6, 0.0, 1e6])
-def test_a_lens_that_folds_has_finite_rays(k1, k2):
-    slopes = np.array([[0.0, 0.0], [0.3, -0.2], [3.0, 2.0]])
-    factor = narrowing(np.array([0.5, k1, k2]), slopes)
-    assert np.isfinite(factor).all()
-    assert (factor >= 0).all()
+@pytest.mark.parametrize("p1", [0.0, 10.0])
+def test_a_lens_that_folds_has_finite_rays(k1, k2, p1):
+    shown = np.array([[0.0, 0.0], [0.3, -0.2], [3.0, 2.0]])
+    found = slopes_seen(np.array([0.5, k1, k2, 0.0, 0.0, p1, 0.0, 0.0]), shown)
+    assert np.isfinite(found).all()

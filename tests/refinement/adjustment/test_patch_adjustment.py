@@ -19,6 +19,13 @@ from tests.refinement.adjustment.rig import disturbed, look_at_origin, rotation_
 SIZE, FOCAL = 64, 80.0
 
 
+# Two lenses: log focal length, k1, k2, principal point, p1, p2, aspect.
+BENT = [
+    [0.02, 0.05, -0.03, 0.005, -0.01, 0.002, -0.003, 0.01],
+    [-0.01, 0.0, 0.04, 0.0, 0.005, -0.002, 0.001, -0.01],
+]
+
+
 @pytest.fixture(name="rng")
 def generator():
     return np.random.default_rng(5)
@@ -76,15 +83,13 @@ def test_a_blur_keeps_the_mean_and_lowers_the_contrast(rng):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "correction", [None, [[0.02, 0.05, -0.03], [-0.01, 0.0, 0.04]]], ids=["held", "free"]
-)
+@pytest.mark.parametrize("correction", [None, BENT], ids=["held", "free"])
 def test_normal_equations_are_those_of_autograd(rng, correction):
     plane = Plane(rng, cameras=3)
     poses = disturbed(plane.truth, rng, 0.003, 0.005)
     evidence = plane.evidence(poses, per_photo=2)
     lens_of = [0, 0, 1]
-    lenses = correction and Lenses(np.array(lens_of), np.array(correction), np.ones((2, 3)))
+    lenses = correction and Lenses(np.array(lens_of), np.array(correction), np.ones((2, 8)))
     cameras = Cameras.of(poses, lenses)
     term = PatchTerm(evidence.patches, evidence.intrinsics, cameras)
     term.scale = 1.5
@@ -97,8 +102,8 @@ def test_normal_equations_are_those_of_autograd(rng, correction):
     before = torch.from_numpy(cameras.lens)
 
     def residuals(unknown, scale):
-        change = unknown[18:].reshape(-1, 3)
-        lens = (before + change)[lens_of] if correction else torch.zeros(3, 3, dtype=torch.float64)
+        change = unknown[18:].reshape(-1, 8)
+        lens = (before + change)[lens_of] if correction else torch.zeros(3, 8, dtype=torch.float64)
         turned, moved = reference.moved(rotation, centre, unknown[:18].reshape(3, 6))
         parts = []
         for i, j in zip(patches.point.tolist(), patches.target.tolist(), strict=True):

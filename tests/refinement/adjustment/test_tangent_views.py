@@ -75,8 +75,8 @@ def test_a_pinhole_among_fisheyes_finds_its_focal_length(rng):
     truth, evidence = scene(rng, SOME)
     long = Camera("PINHOLE", 400, 400, (520.0, 505.0 * 1.04, 201.0, 199.0))
     wrong = Intrinsics.from_cameras([FISHEYE, long] * (CAMERAS // 2))
-    deviation = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]])
-    lenses = Lenses(np.arange(CAMERAS) % 2, np.zeros((2, 3)), deviation)
+    deviation = np.array([[0.0] * 8, [0.1] + [0.0] * 7])
+    lenses = Lenses(np.arange(CAMERAS) % 2, np.zeros((2, 8)), deviation)
     found = adjust_poses(
         truth, Evidence(wrong, evidence.tracks, lenses=lenses), PosePrior.equal(truth, 0.1, 0.4)
     )

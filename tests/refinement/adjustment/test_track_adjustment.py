@@ -16,6 +16,12 @@ from biresnerf.refinement.adjustment.lens.lenses import Lenses
 from biresnerf.refinement.adjustment.track_term import ROBUST_SCALE, TrackTerm
 from tests.refinement.adjustment.rig import disturbed, observed, pinholes, ring, rotation_errors_deg
 
+# Two lenses: log focal length, k1, k2, principal point, p1, p2, aspect.
+BENT = [
+    [0.04, 0.05, -0.02, 0.01, -0.02, 0.004, -0.003, 0.01],
+    [-0.02, 0.0, 0.03, 0.0, 0.005, -0.002, 0.001, -0.02],
+]
+
 
 @pytest.fixture(name="rng")
 def generator():
@@ -32,9 +38,7 @@ def loose(poses):
     return PosePrior.equal(poses, 0.1, 0.4)
 
 
-@pytest.mark.parametrize(
-    "correction", [None, [[0.04, 0.05, -0.02], [-0.02, 0.0, 0.03]]], ids=["held", "free"]
-)
+@pytest.mark.parametrize("correction", [None, BENT], ids=["held", "free"])
 @pytest.mark.parametrize("threads", [1, 4, 12], ids=lambda n: f"{n}-threads")  # of 9 points
 def test_normal_equations_are_those_of_autograd(rng, correction, threads, monkeypatch):
     monkeypatch.setattr(numba, "get_num_threads", lambda: threads)
@@ -52,8 +56,8 @@ def test_normal_equations_are_those_of_autograd(rng, correction, threads, monkey
     before = torch.from_numpy(cameras.lens)
 
     def residuals(unknown, xyz):
-        motion, change = unknown[:24].reshape(4, 6), unknown[24:].reshape(-1, 3)
-        now = (before + change)[[0, 0, 1, 1]] if correction else torch.zeros(4, 3, dtype=torch.float64)
+        motion, change = unknown[:24].reshape(4, 6), unknown[24:].reshape(-1, 8)
+        now = (before + change)[[0, 0, 1, 1]] if correction else torch.zeros(4, 8, dtype=torch.float64)
         lens = reference.with_lens(pinhole, now)
         return reference.track_residuals(
             *reference.moved(rotation, centre, motion), lens, xyz, *index, xy
@@ -78,7 +82,7 @@ def test_normal_equations_are_those_of_autograd(rng, correction, threads, monkey
 
 def two_lenses(correction):
     """Of four cameras, two each."""
-    return Lenses(np.array([0, 0, 1, 1]), np.array(correction), np.ones((2, 3)))
+    return Lenses(np.array([0, 0, 1, 1]), np.array(correction), np.ones((2, 8)))
 
 
 def test_cameras_return_to_the_truth_from_a_degree_away(rng):

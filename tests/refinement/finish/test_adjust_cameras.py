@@ -35,10 +35,12 @@ def generator():
     return np.random.default_rng(2)
 
 
-def stages(folder, rng, *, given=None, refined=0.01, noise_px=0.02, points=120, focal=1.0, source="given"):
+def stages(
+    folder, rng, *, given=None, refined=0.01, noise_px=0.02, points=120, focal=1.0, centre=(0, 0), source="given"
+):  # fmt: skip
     """A run whose poses ended off the truth by `refined` rad, with tracks of the full-size photos.
 
-    The set has a focal length that is `focal` times too long.
+    The set has a focal length that is `focal` times too long, and a principal point off by `centre` focal lengths.
     """
     dataset, images = tiny_set(folder, VIEWS, 24)
     truth = dataset.world_from_cam
@@ -48,7 +50,10 @@ def stages(folder, rng, *, given=None, refined=0.01, noise_px=0.02, points=120, 
             replace(f, world_from_cam=pose) for f, pose in zip(dataset.frames, given(truth), strict=True)
         ]
         dataset = replace(dataset, frames=tuple(frames))
-    wrong = tuple(corrected_camera(c, np.array([np.log(focal), 0, 0])) for c in dataset.cameras)
+    wrong = tuple(
+        corrected_camera(c, np.array([np.log(focal), 0.0, 0.0, *centre, *(0.0,) * 3]))
+        for c in dataset.cameras
+    )
     dataset = replace(dataset, cameras=wrong, intrinsics_sources=(source,) * len(wrong))
     scene = replace(given_scene(dataset, images), tracks=tracks)
     optimiser = tiny_optimiser(dataset, images, tiny_options())
@@ -174,6 +179,25 @@ def test_a_guessed_focal_length_is_found_with_the_poses(tmp_path, rng):
     assert known.deviation < 0.005
     report = camera_reports(run.scene.dataset, run.optimiser.lenses)[0]
     assert (report.source, report.refined, report.observable) == ("guessed", "focal", True)
+
+
+def test_an_unknown_principal_point_is_found_with_the_poses_and_nothing_else_is_freed(tmp_path, rng):
+    run, truth = stages(
+        tmp_path, rng, points=400, noise_px=0.004, centre=(0.02, -0.015), source="guessed", given=wild(rng)
+    )
+    before, true = run.scene.dataset.cameras[0], tiny_set(tmp_path / "again", VIEWS, 24)[0].cameras[0].full()
+    adjust_cameras(run)
+    after = run.optimiser.lenses.refined(run.scene.dataset).cameras[0]
+    assert after.model == before.model
+    assert after.full().cx == pytest.approx(true.cx, abs=0.2 * abs(before.full().cx - true.cx))
+    assert after.full().cy == pytest.approx(true.cy, abs=0.2 * abs(before.full().cy - true.cy))
+    assert errors_deg(run, truth).mean() < 0.1
+
+
+def test_a_principal_point_that_was_given_stays(tmp_path, rng):
+    run, _ = stages(tmp_path, rng, points=400, centre=(0.02, -0.015), given=wild(rng))
+    adjust_cameras(run)
+    assert run.optimiser.lenses.refined(run.scene.dataset).cameras == run.scene.dataset.cameras
 
 
 def test_a_given_focal_length_is_kept_and_warned_of_where_matches_contradict_it(tmp_path, rng):

@@ -70,7 +70,7 @@ def test_a_focal_length_that_is_not_known_widens_the_bounds(rng):
     truth = ring(CAMERAS, rng)
     tracks = observed(truth, rng.uniform(-0.8, 0.8, (120, 3)), pinholes(CAMERAS), rng, 0.5)
     held = Evidence(pinholes(CAMERAS), tracks)
-    lenses = Lenses(np.zeros(CAMERAS, np.int64), np.zeros((1, LENS)), np.array([[0.02, 0.0, 0.0]]))
+    lenses = Lenses(np.zeros(CAMERAS, np.int64), np.zeros((1, LENS)), np.array([[0.02] + [0.0] * 7]))
     known, unknown = (expected_errors(truth, truth, each) for each in (held, replace(held, lenses=lenses)))
     for one, other in zip(known.bounds_90(), unknown.bounds_90(), strict=True):
         assert (other > 0.999 * one).all()

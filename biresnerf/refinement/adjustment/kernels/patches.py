@@ -13,6 +13,7 @@ import numpy as np
 
 from biresnerf.field.numba_kernels import njit
 from biresnerf.refinement.adjustment.kernels.compiled import KERNEL
+from biresnerf.refinement.adjustment.kernels.lens import bent, bent_slopes, by_unknown
 from biresnerf.refinement.adjustment.kernels.photo_samples import sample
 
 SCAN, HALVINGS = 6, 5  # steps to either side of a scan, and how often the last one's length is halved
@@ -20,12 +21,15 @@ UNSEEN = 1e9  # squared error of a comparison that leaves the photo
 
 
 @njit(**KERNEL)
-def compare(rotation, centre, lens, photos, values, host, target, rays, rho, s, floor, slope, jac, r, work):
+def compare(
+    rotation, centre, lens, photos, values, host, target, rays, rho, s, floor, slope, kinds, jac, r, work
+):  # fmt: skip
     """Mean square of one comparison in the noise expected of its pixels, and that noise's variance.
 
     Args:
-        jac: [k, channels, 13 or 19], filled with derivatives by the host's increment, the target's and the scale; or
-            empty. Of 19, each increment ends with that of the lens.
+        kinds: which parameters of lenses are unknown.
+        jac: [k, channels, 13 + 2 kinds], filled with derivatives by the host's increment, the target's and the scale;
+            or empty. Each increment ends with that of the lens.
         r: [k, channels], filled with the residuals.
         values: [k, channels], of the host photo.
         floor, slope: standard deviation of a pixel, and what its gradient adds to it.
@@ -33,7 +37,6 @@ def compare(rotation, centre, lens, photos, values, host, target, rays, rho, s, 
     coefficients, frames = photos
     out, wx, dx, wy, dy, a, v, q, g = work
     channels = coefficients.shape[1]
-    k1, k2 = lens[target, 5], lens[target, 6]
     squares, steep = 0.0, 0.0
     for k in range(len(rho)):
         depth = s * rho[k]
@@ -52,12 +55,8 @@ def compare(rotation, centre, lens, photos, values, host, target, rays, rho, s, 
             return UNSEEN, 1.0
         z = 1.0 / q[2]
         ux, uy = q[0] * z, q[1] * z
-        off = ux * ux + uy * uy
-        radial = 1 + off * (k1 + off * k2)
-        x, y = (
-            lens[target, 0] * radial * ux + lens[target, 2],
-            lens[target, 1] * radial * uy + lens[target, 3],
-        )
+        x, y = bent(lens, target, ux, uy)
+        x, y = lens[target, 0] * x + lens[target, 2], lens[target, 1] * y + lens[target, 3]
         if not sample(coefficients, frames, target, x, y, out, wx, dx, wy, dy):
             return UNSEEN, 1.0
         for c in range(channels):
@@ -67,8 +66,8 @@ def compare(rotation, centre, lens, photos, values, host, target, rays, rho, s, 
             if len(jac) == 0:
                 continue
             differentiate(
-                rotation, centre, lens, host, target, rays[k], rho[k], depth, a, v, z, ux, uy, radial,
-                out[c, 1] * lens[target, 0], out[c, 2] * lens[target, 1], g, jac[k, c],
+                rotation, centre, lens, host, target, rays[k], rho[k], depth, a, v, z, ux, uy,
+                out[c, 1] * lens[target, 0], out[c, 2] * lens[target, 1], kinds, g, jac[k, c],
             )  # fmt: skip
     count = len(rho) * channels
     variance = floor * floor + slope * slope * steep / count
@@ -77,19 +76,23 @@ def compare(rotation, centre, lens, photos, values, host, target, rays, rho, s, 
 
 @njit(inline="always", **KERNEL)
 def differentiate(
-    rotation, centre, lens, host, target, ray, rho, depth, a, v, z, ux, uy, radial, gx, gy, g, row
+    rotation, centre, lens, host, target, ray, rho, depth, a, v, z, ux, uy, gx, gy, kinds, g, row
 ):  # fmt: skip
-    """Fill row [13 or 19], see `compare`: derivatives of one channel of one pixel.
+    """Fill row [13 + 2 kinds], see `compare`: derivatives of one channel of one pixel.
 
     Args:
         a, v: the pixel's direction from the host and from the target, in the world; g: room for three numbers.
-        z, ux, uy, radial: one over its depth in the target, its slopes there, and the lens's factor of them.
+        z, ux, uy: one over its depth in the target, and its slopes there.
         gx, gy: gradient of the target's colour in focal lengths.
     """
     width = len(row) // 2
-    off, along = ux * ux + uy * uy, gx * ux + gy * uy
-    bent = (2 * lens[target, 5] + 4 * off * lens[target, 6]) * along
-    gx, gy = (radial * gx + bent * ux) * z, (radial * gy + bent * uy) * z
+    if width > 6:
+        at_x, at_y = bent(lens, target, ux, uy)
+        for k in range(len(kinds)):
+            dx, dy = by_unknown(lens, target, kinds[k], ux, uy, at_x, at_y)
+            row[width + 6 + k] = gx * dx + gy * dy
+    xx, across, yy = bent_slopes(lens, target, ux, uy)
+    gx, gy = (xx * gx + across * gy) * z, (across * gx + yy * gy) * z
     gz = -(gx * ux + gy * uy)
     row[2 * width] = 0
     for x in range(3):
@@ -102,20 +105,22 @@ def differentiate(
     row[width + 1] = v[0] * g[2] - v[2] * g[0]
     row[width + 2] = v[1] * g[0] - v[0] * g[1]
     if width > 6:
-        row[width + 6], row[width + 7], row[width + 8] = radial * along, off * along, off * off * along
-        host_lens(rotation, lens, host, ray, a, g, row)
+        host_lens(rotation, lens, host, ray, kinds, g, row)
 
 
 @njit(inline="always", **KERNEL)
-def host_lens(rotation, lens, host, ray, a, g, row):
-    """Columns 6 to 8 of row: derivative by the host's lens, which changes the direction of its pixels."""
-    k1, k2 = lens[host, 5], lens[host, 6]
-    off = ray[0] * ray[0] + ray[1] * ray[1]
-    across = 0.0
-    for x in range(3):
-        across += g[x] * (a[x] - rotation[host, x, 2])
-    across /= 1 + off * (3 * k1 + 5 * off * k2)
-    row[6], row[7], row[8] = -across * (1 + off * (k1 + off * k2)), -across * off, -across * off * off
+def host_lens(rotation, lens, host, ray, kinds, g, row):
+    """Columns of row from the seventh on: derivative by the host's lens, which changes the direction of its pixels."""
+    x, y = ray[0], ray[1]
+    at_x, at_y = bent(lens, host, x, y)
+    xx, across, yy = bent_slopes(lens, host, x, y)
+    determinant = xx * yy - across * across
+    gx = g[0] * rotation[host, 0, 0] + g[1] * rotation[host, 1, 0] + g[2] * rotation[host, 2, 0]
+    gy = g[0] * rotation[host, 0, 1] + g[1] * rotation[host, 1, 1] + g[2] * rotation[host, 2, 1]
+    by_x, by_y = (yy * gx - across * gy) / determinant, (xx * gy - across * gx) / determinant
+    for k in range(len(kinds)):
+        dx, dy = by_unknown(lens, host, kinds[k], x, y, at_x, at_y)
+        row[6 + k] = -(by_x * dx + by_y * dy)
 
 
 @njit(**KERNEL)
@@ -134,11 +139,12 @@ def patch_errors(
     """Mean square [m] of each comparison."""
     pixels, channels = values.shape[1], values.shape[2]
     work, r, none = work_space(channels), np.empty((pixels, channels)), np.empty((0, channels, 13))
+    held = np.empty(0, np.int64)
     for i in range(len(host)):
         for e in range(start[i], start[i + 1]):
             squared[e], _ = compare(
                 rotation, centre, lens, photos, values[i], host[i], target[e], rays[i], rho[i], s[i], floor, slope,
-                none, r, work,
+                held, none, r, work,
             )  # fmt: skip
 
 
@@ -164,6 +170,7 @@ def settle_scales(
     """Move each patch's scale to the least cost that a scan of s (1 - reach .. 1 + reach) leads to, in place."""
     pixels, channels = values.shape[1], values.shape[2]
     work, r, none = work_space(channels), np.empty((pixels, channels)), np.empty((0, channels, 13))
+    held = np.empty(0, np.int64)
     s2, first = scale * scale, s.copy()
     for i in range(len(host)):
         best, step = np.inf, reach / SCAN
@@ -180,7 +187,7 @@ def settle_scales(
             for e in range(start[i], start[i + 1]):
                 e2, _ = compare(
                     rotation, centre, lens, photos, values[i], host[i], target[e], rays[i], rho[i], tried, floor, slope,
-                    none, r, work,
+                    held, none, r, work,
                 )  # fmt: skip
                 cost += s2 * e2 / (s2 + e2) * pixels * channels
             if cost < best:
@@ -189,14 +196,15 @@ def settle_scales(
 
 @njit(**KERNEL)
 def patch_system(
-    rotation, centre, lens, photos, values, host, rays, rho, start, target, s, host_rows, target_rows, floor, slope,
-    scale, deviation, noise, damping, system, right, of_target,
+    rotation, centre, lens, photos, values, host, rays, rho, start, target, s, host_rows, target_rows, kinds, floor,
+    slope, scale, deviation, noise, damping, system, right, of_target,
 ):  # fmt: skip
     """Add the normal equations without the scales to system [u, u] and right [u], which is half the gradient.
 
     Args:
-        host_rows, target_rows: [patches, w], [m, w], where the w = 6 or 9 unknowns of each one's camera, and those of
+        host_rows, target_rows: [patches, w], [m, w], where the w = 6 + k unknowns of each one's camera, and those of
             its lens, are among all u.
+        kinds: [k], which of a lens's parameters these are.
 
     Returns of each patch the inverse of its own entry and its gradient, and the mixed row of its host. Fills that of
     each target [m, w].
@@ -219,7 +227,7 @@ def patch_system(
         for e in range(start[i], start[i + 1]):
             e2, variance = compare(
                 rotation, centre, lens, photos, values[i], host[i], target[e], rays[i], rho[i], s[i], floor, slope,
-                jac, r, work,
+                kinds, jac, r, work,
             )  # fmt: skip
             if e2 >= UNSEEN:
                 continue

@@ -1,9 +1,8 @@
 """Points seen in several photos: reprojection residuals, and the cameras' normal equations without the points.
 
 The definitions are in `biresnerf.refinement.adjustment.reference`. A point's observations lie one after the other.
-Cameras are R = rotation [n, 3, 3] (world from cam), c = centre [n, 3]; lens [n, 7] is fx, fy, cx, cy, the least depth
-that is in front, and k1, k2 of a radial factor. An increment of a camera is a rotation vector w and a shift s, both in
-the world's axes: exp(w) R and c + s. One of a lens is of log f, k1 and k2.
+Cameras are R = rotation [n, 3, 3] (world from cam), c = centre [n, 3]; lenses are those of `lens`. An increment of a
+camera is a rotation vector w and a shift s, both in the world's axes: exp(w) R and c + s.
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ import numpy as np
 
 from biresnerf.field.numba_kernels import njit
 from biresnerf.refinement.adjustment.kernels.compiled import KERNEL, LEAST_DETERMINANT
+from biresnerf.refinement.adjustment.kernels.lens import bent, bent_slopes, by_unknown
 
 
 @njit(inline="always", **KERNEL)
@@ -23,11 +23,9 @@ def project_point(rotation, centre, lens, cam, x, xy, r, v, q):
         q[a] = rotation[cam, 0, a] * v[0] + rotation[cam, 1, a] * v[1] + rotation[cam, 2, a] * v[2]
     if not q[2] > lens[cam, 4]:
         return False
-    x, y = q[0] / q[2], q[1] / q[2]
-    s = x * x + y * y
-    radial = 1 + s * (lens[cam, 5] + s * lens[cam, 6])
-    r[0] = lens[cam, 0] * radial * x + lens[cam, 2] - xy[0]
-    r[1] = lens[cam, 1] * radial * y + lens[cam, 3] - xy[1]
+    x, y = bent(lens, cam, q[0] / q[2], q[1] / q[2])
+    r[0] = lens[cam, 0] * x + lens[cam, 2] - xy[0]
+    r[1] = lens[cam, 1] * y + lens[cam, 3] - xy[1]
     return True
 
 
@@ -36,31 +34,23 @@ def point_jacobian(rotation, lens, cam, q, jac):
     """jac [2, 3]: derivative of the residual in the point."""
     z = 1.0 / q[2]
     x, y = q[0] * z, q[1] * z
-    s = x * x + y * y
-    radial = 1 + s * (lens[cam, 5] + s * lens[cam, 6])
-    slope = 2 * lens[cam, 5] + 4 * s * lens[cam, 6]  # of it, by half of s
+    xx, across, yy = bent_slopes(lens, cam, x, y)
     for row in range(2):
         f = lens[cam, row] * z
-        own = x if row == 0 else y
-        gx, gy = f * slope * own * x, f * slope * own * y
-        if row == 0:
-            gx += f * radial
-        else:
-            gy += f * radial
+        gx, gy = (f * xx, f * across) if row == 0 else (f * across, f * yy)
         gz = -(gx * x + gy * y)
         for a in range(3):
             jac[row, a] = rotation[cam, a, 0] * gx + rotation[cam, a, 1] * gy + rotation[cam, a, 2] * gz
 
 
 @njit(inline="always", **KERNEL)
-def lens_jacobian(lens, cam, q, camera):
-    """Columns 6 to 8 of camera [2, 9]: derivative of the residual in the lens."""
+def lens_jacobian(lens, cam, kinds, q, camera):
+    """Columns of camera [2, 6 + kinds] from the seventh on: derivative of the residual in the lens's unknowns."""
     x, y = q[0] / q[2], q[1] / q[2]
-    s = x * x + y * y
-    radial = 1 + s * (lens[cam, 5] + s * lens[cam, 6])
-    for row in range(2):
-        f = lens[cam, row] * (x if row == 0 else y)
-        camera[row, 6], camera[row, 7], camera[row, 8] = f * radial, f * s, f * s * s
+    at_x, at_y = bent(lens, cam, x, y)
+    for k in range(len(kinds)):
+        dx, dy = by_unknown(lens, cam, kinds[k], x, y, at_x, at_y)
+        camera[0, 6 + k], camera[1, 6 + k] = lens[cam, 0] * dx, lens[cam, 1] * dy
 
 
 @njit(inline="always", **KERNEL)
@@ -188,20 +178,21 @@ def eliminate_point(rows, first, last, blocks, forces, mixed, inverse, gradient,
 
 @njit(**KERNEL)
 def track_system(
-    rotation, centre, lens, xyz, start, image, xy, rows, sigma, scale, damping, system, right, mixed
+    rotation, centre, lens, xyz, start, image, xy, rows, kinds, sigma, scale, damping, system, right, mixed
 ):  # fmt: skip
     """Add the normal equations without the points to system [u, u] and right [u], which is half the gradient.
 
     Args:
-        rows: [m, 6 or 9], where the unknowns of each observation's camera, and those of its lens, are among all u.
-        mixed: zero; gets the mixed block [m, 6 or 9, 3] of each observation of these points.
+        rows: [m, 6 + k], where the unknowns of each observation's camera, and those of its lens, are among all u.
+        kinds: [k], which of a lens's parameters these are.
+        mixed: zero; gets the mixed block [m, 6 + k, 3] of each observation of these points.
 
     Returns for each point the inverse of its own block and its gradient.
     A point that its observations do not fix in this precision has a zero inverse, and no say.
     """
     points, width = len(xyz), rows.shape[1]
     inverses, gradients = np.zeros((points, 3, 3)), np.zeros((points, 3))
-    own, jac, camera = np.empty((3, 3)), np.empty((2, 3)), np.empty((2, 9))
+    own, jac, camera = np.empty((3, 3)), np.empty((2, 3)), np.empty((2, width))
     r, v, q = np.empty(2), np.empty(3), np.empty(3)
     s2, iv = scale * scale, 1.0 / (sigma * sigma)
     most = 0
@@ -227,7 +218,7 @@ def track_system(
                 for a in range(3):
                     camera[k, 3 + a] = -jac[k, a]
             if width > 6:
-                lens_jacobian(lens, cam, q, camera)
+                lens_jacobian(lens, cam, kinds, q, camera)
             for k in range(2):
                 for a in range(3):
                     gradients[i, a] += w * jac[k, a] * r[k]

@@ -1,4 +1,4 @@
-"""From a correction of ideal pixels back to a camera of the user's own model."""
+"""From a correction of ideal pixels back to a camera of the user's own model, or of one that can hold it."""
 
 from __future__ import annotations
 
@@ -7,43 +7,70 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS, Camera, FullParameters
+from biresnerf.geometry.camera.camera_models import (
+    MODEL_PARAMETERS,
+    Camera,
+    FullParameters,
+    smallest_model,
+)
+from biresnerf.geometry.camera.distortion import coefficients_of, distort
+from biresnerf.geometry.camera.pixel_rays import rays_of_pixels
+from biresnerf.refinement.adjustment.lens.lenses import ASPECT, CENTRE, DISTORTION, FOCAL
 
-RADII = 64
+Array = NDArray[np.float64]
+
+STEPS = 24  # along each side of the image, of the grid that the new lens is fitted to
+FITTED = ("k1", "k2", "p1", "p2")
 
 
-def corrected_camera(camera: Camera, correction: NDArray[np.float64]) -> Camera:
-    """A camera after a correction [3] (log focal length, k1, k2; see `Cameras`), in the same model.
+def corrected_camera(camera: Camera, correction: Array) -> Camera:
+    """A camera after a correction [8] (see `lenses`), in the same model where that has a place for all of it.
 
-    The corrected lens shows slopes u where the camera shows e^l (1 + k1 |u|^2 + k2 |u|^4) u. For the focal length that
-    is a lens of the same model, exactly; so it is for a camera without distortion. Otherwise the coefficients k1 and k2
-    that the model has are fitted, over all radii within the image. Fisheyes have no correction.
+    The corrected lens shows a direction where the camera would show another one. For a focal length that is a lens of
+    the same model, exactly; so it is for a camera without distortion. Otherwise the principal point and the
+    coefficients up to k2, p1 and p2 that the model has are fitted, over the whole image. Fisheyes have no correction.
     """
     if not correction.any():
         return camera
-    longer = float(np.exp(correction[0]))
+    longer = float(np.exp(correction[FOCAL]))
     old = camera.full()
     lens = old._replace(
         fx=old.fx * longer, fy=old.fy * longer, p1=old.p1 * longer, p2=old.p2 * longer,
         k1=old.k1 * longer**2, k2=old.k2 * longer**4, k3=old.k3 * longer**6,
         k4=old.k4 * longer**2, k5=old.k5 * longer**4, k6=old.k6 * longer**6,
     )  # fmt: skip
-    names = radial_names(camera)
-    if names and correction[1:].any():
-        radius = np.linspace(0, corner(camera), RADII + 1)[1:]
-        aim = _shown(lens, radius * (1 + correction[1] * radius**2 + correction[2] * radius**4))
-        without = lens._replace(k1=0.0, k2=0.0 if "k2" in names else lens.k2)
-        below = 1 + lens.k4 * radius**2 + lens.k5 * radius**4 + lens.k6 * radius**6
-        columns = np.stack([radius ** (3 + 2 * i) / below for i in range(len(names))], 1)
-        found = np.linalg.lstsq(columns, aim - _shown(without, radius), rcond=None)[0]
-        lens = lens._replace(k1=float(found[0]), k2=float(found[1]) if "k2" in names else lens.k2)
-    values = lens._asdict() | {"f": lens.fx}
-    return replace(camera, params=tuple(values[name] for name in MODEL_PARAMETERS[camera.model]))
+    if correction[FOCAL + 1 :].any():
+        lens = _fitted(lens, camera, correction)
+    model, params = smallest_model(lens, camera.model)
+    return replace(camera, model=model, params=params)
 
 
-def radial_names(camera: Camera) -> list[str]:
-    """Which of k1 and k2 a perspective camera's model has."""
-    return [name for name in ("k1", "k2") if name in MODEL_PARAMETERS[camera.model]]
+def _fitted(lens: FullParameters, camera: Camera, correction: Array) -> FullParameters:
+    """A lens with what it may differ in fitted to the corrected camera, over the whole image.
+
+    In f, f k1, f k2, f p1, f p2 and the principal point everything is linear, if y is counted in fx.
+    """
+    old, slopes = camera.full(), _grid(camera)
+    moved = dict(zip(FITTED, correction[DISTORTION].tolist(), strict=True))
+    names = [name for name in FITTED if name in MODEL_PARAMETERS[camera.model] or moved[name]]
+    aspect = float(np.exp(correction[ASPECT]))
+    bent = _bent(slopes, FullParameters(1.0, 1.0, 0.0, 0.0, **moved)) * [1.0, aspect]
+    shown = _bent(bent * np.exp(correction[FOCAL]) + correction[CENTRE], old)
+    aspect *= old.fy / old.fx
+    aim = (shown * [old.fx, old.fy] + [old.cx, old.cy]) / [1.0, aspect]
+    without = lens._asdict() | dict.fromkeys(names, 0.0)
+    plain = _bent(slopes, FullParameters(**without))
+    ones, none = np.ones(len(slopes)), np.zeros(len(slopes))
+    columns = [
+        plain,
+        *(_bent(slopes, FullParameters(**without | {name: 1.0})) - plain for name in names),
+        np.stack([ones, none], 1),
+        np.stack([none, ones / aspect], 1),
+    ]
+    matrix = np.stack([column.reshape(-1) for column in columns], 1)
+    focal, *scaled, cx, cy = np.linalg.lstsq(matrix, aim.reshape(-1), rcond=None)[0].tolist()
+    fitted = {name: value / focal for name, value in zip(names, scaled, strict=True)}
+    return FullParameters(**without | fitted | {"fx": focal, "fy": focal * aspect, "cx": cx, "cy": cy})
 
 
 def corner(camera: Camera) -> float:
@@ -53,8 +80,14 @@ def corner(camera: Camera) -> float:
     return float(np.hypot(x, y))
 
 
-def _shown(lens: FullParameters, radius: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Radii after the radial distortion."""
-    s = radius**2
-    above = 1 + s * (lens.k1 + s * (lens.k2 + s * lens.k3))
-    return np.asarray(radius * above / (1 + s * (lens.k4 + s * (lens.k5 + s * lens.k6))))
+def _grid(camera: Camera) -> Array:
+    """Slopes [m, 2] of pixels all over the image."""
+    at = (np.arange(STEPS) + 0.5) / STEPS
+    x, y = np.meshgrid(at * camera.width, at * camera.height)
+    rays = rays_of_pixels(camera.full(), np.stack([x.ravel(), y.ravel()], 1))
+    return np.asarray(rays[:, :2] / rays[:, 2:])
+
+
+def _bent(slopes: Array, lens: FullParameters) -> Array:
+    """Slopes [m, 2] after a lens's distortion."""
+    return np.stack(distort(slopes[:, 0], slopes[:, 1], coefficients_of(lens)), 1)

@@ -1,4 +1,10 @@
-"""What is known of lenses before an adjustment, and after it."""
+"""What is known of lenses before an adjustment, and after it.
+
+A lens is a correction [8] of the pinhole that the evidence was made with: the logarithm l of the focal length's ratio,
+k1, k2, the principal point's shift in focal lengths, p1, p2, and the logarithm a of the ratio of fy to fx. A point
+at slopes u, v appears where that pinhole shows the slopes e^l u' + shift_x, e^(l + a) v' + shift_y, with u', v' as in
+`biresnerf.geometry.camera.distortion`.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +13,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.geometry.camera.distortion import Coefficients, distort, distort_jacobian
+
 Array = NDArray[np.float64]
 
-LENS = 3  # unknowns of a lens: log focal length and two radial coefficients
+LENS = 8  # unknowns of a lens
+FOCAL, K1, K2, CENTRE, TANGENTIAL, ASPECT = 0, 1, 2, slice(3, 5), slice(5, 7), 7
+DISTORTION = [1, 2, 5, 6]  # k1, k2, p1, p2
+# In the order in which they are given up where the evidence does not tell of them, the last first, and freed.
+KINDS = ((0,), (3, 4), (1,), (2,), (5, 6), (7,))
 # A parameter is known from the evidence if its standard deviation there is less than this share of the one before: the
 # evidence then has eight ninths of the say.
 OBSERVABLE = 1 / 3
@@ -17,6 +29,7 @@ RANK = 1e-13  # of the largest eigenvalue: what is smaller is rounding, or one o
 ROUNDING = 1e-12  # of a lens's own information: what poses leave of it, if that is not more, is rounding
 NEWTON = 8
 FURTHEST = 2.0  # times the slope itself that Newton's method may go
+LEAST_AREA = 0.1  # that it takes a lens to shrink things to
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,8 +38,8 @@ class Lenses:
 
     Attributes:
         of_image: int64 [n], the lens of each image.
-        correction: [g, 3], known before: zero, or what was found earlier.
-        deviation: [g, 3], standard deviation of the error of what is known before. Zero: held. Infinite: not known.
+        correction: [g, 8], known before: zero, or what was found earlier.
+        deviation: [g, 8], standard deviation of the error of what is known before. Zero: held. Infinite: not known.
     """
 
     of_image: NDArray[np.int64]
@@ -35,15 +48,15 @@ class Lenses:
 
     @property
     def free(self) -> NDArray[np.bool_]:
-        """Which parameters [g, 3] may move."""
+        """Which parameters [g, 8] may move."""
         return self.deviation > 0
 
     def held(self, which: NDArray[np.bool_]) -> Lenses:
-        """With some parameters [g, 3] held where they are."""
+        """With some parameters [g, 8] held where they are."""
         return replace(self, deviation=np.where(which, 0.0, self.deviation))
 
     def known(self, correction: Array) -> Lenses:
-        """The same lenses after a correction [g, 3], all held."""
+        """The same lenses after a correction [g, 8], all held."""
         return Lenses(self.of_image, correction, np.zeros_like(correction))
 
 
@@ -52,9 +65,9 @@ class LensEstimate:
     """Lenses after an adjustment.
 
     Attributes:
-        correction: [g, 3], of the evidence's lenses.
-        deviation: [g, 3], standard deviation as prior and evidence give it; NaN where nothing was to be found.
-        observable: [g, 3], whether the evidence tells. Where it does not, the parameter is as it was.
+        correction: [g, 8], of the evidence's lenses.
+        deviation: [g, 8], standard deviation as prior and evidence give it; NaN where nothing was to be found.
+        observable: [g, 8], whether the evidence tells. Where it does not, the parameter is as it was.
     """
 
     correction: Array
@@ -63,7 +76,7 @@ class LensEstimate:
 
 
 def posterior(information: Array, poses: int, lenses: Lenses) -> Array:
-    """Standard deviations [g, 3] of lenses, with poses unknown but for the evidence; NaN of those held.
+    """Standard deviations [g, 8] of lenses, with poses unknown but for the evidence; NaN of those held.
 
     The prior of the poses has no part in it: if they err alike, it would pass for knowledge of the lens.
 
@@ -96,18 +109,24 @@ def _deviations(own: Array, shared: Array, before: Array) -> Array:
         return np.asarray(np.sqrt(shares.sum(1)) / size)
 
 
-def narrowing(lens: Array, slopes: Array) -> Array:
-    """Factor [..., 1] that undoes e^l (1 + k1 t^2 + k2 t^4) for slopes [..., 2]; lens [..., 3] is l, k1, k2.
+def slopes_seen(lens: Array, shown: Array) -> Array:
+    """Slopes [..., 2] that lenses [..., 8] show where the evidence's pinhole shows other slopes [..., 2].
 
-    Newton's method on the radius t. A lens that folds within twice a slope's radius has no answer there; the factor is
-    then wrong, but finite.
+    Newton's method. A lens that folds within twice a slope's radius has no answer there; what is returned is then
+    wrong, but finite.
     """
-    radius = np.linalg.norm(slopes, axis=-1, keepdims=True)
-    aim, k1, k2 = radius * np.exp(-lens[..., :1]), lens[..., 1:2], lens[..., 2:]
+    scale = np.exp(-lens[..., [FOCAL]] - lens[..., [ASPECT]] * [0.0, 1.0])
+    aim = (shown - lens[..., CENTRE]) * scale
+    c = Coefficients((lens[..., 1], lens[..., 2]), (), (lens[..., 5], lens[..., 6]))
+    farthest = FURTHEST * np.linalg.norm(aim, axis=-1, keepdims=True)
     found = aim
     for _ in range(NEWTON):
-        square = found**2
-        value = found * (1 + square * (k1 + square * k2)) - aim
-        found = found - value / np.maximum(1 + square * (3 * k1 + 5 * square * k2), 0.1)
-        found = np.clip(found, 0, FURTHEST * aim)
-    return np.where(radius > 0, found / np.maximum(radius, 1e-300), np.exp(-lens[..., :1]))
+        x, y = found[..., 0], found[..., 1]
+        away = np.stack(distort(x, y, c), -1) - aim
+        xx, xy, yy = distort_jacobian(x, y, c)
+        steep = np.maximum(xx * yy - xy * xy, LEAST_AREA)
+        step = np.stack([yy * away[..., 0] - xy * away[..., 1], xx * away[..., 1] - xy * away[..., 0]], -1)
+        found = found - step / steep[..., None]
+        length = np.linalg.norm(found, axis=-1, keepdims=True)
+        found = found * np.minimum(1.0, farthest / np.maximum(length, 1e-300))
+    return np.asarray(found)

@@ -65,8 +65,8 @@ def without_lenses(information: Array, cameras: Cameras, free: NDArray[np.bool_]
     """The information [6n, 6n] of the poses, whatever the lenses are.
 
     Args:
-        information: [6n + 3g, 6n + 3g], of poses and lenses, with what is known of lenses before.
-        free: which of the 3g unknowns of lenses may move.
+        information: [6n + 8g, 6n + 8g], of poses and lenses, with what is known of lenses before.
+        free: which of the 8g unknowns of lenses may move.
     """
     poses = POSE * len(cameras)
     moving = poses + np.flatnonzero(free)

@@ -32,7 +32,7 @@ class Prior:
     Attributes:
         mean: the cameras before.
         weight: inverse variances [u]; zero where nothing is known.
-        free: which of the u = 6n + 3g unknowns may move.
+        free: which of the u = 6n + 8g unknowns may move.
         bodies: of the cameras, where some are fixed or move as one.
     """
 
@@ -114,13 +114,7 @@ def _step(
     cost: float,
 ) -> tuple[Cameras, float] | None:
     """Cameras and cost after a step that lowers it, the terms' unknowns moved along; None where it does not."""
-    system, right = normal_equations(cameras, linear, prior)
-    directions = prior.directions(cameras)
-    if directions is None:
-        motion = _damped(system, right, prior.free, damping)
-    else:
-        along = _damped(directions.T @ system @ directions, directions.T @ right, None, damping)
-        motion = None if along is None else prior.rigid(cameras, directions @ along)
+    motion = newton_step(cameras, linear, prior, damping)
     if motion is None:
         return None
     moved = cameras.moved(motion)
@@ -131,6 +125,18 @@ def _step(
     for term, found in zip(terms, unknowns, strict=True):
         term.unknowns = found
     return moved, after
+
+
+def newton_step(
+    cameras: Cameras, linear: Sequence[Linearised], prior: Prior, damping: float = 0.0
+) -> Array | None:
+    """The increment [u] of cameras and lenses to the least linearised cost, damped; None where nothing is known."""
+    system, right = normal_equations(cameras, linear, prior)
+    directions = prior.directions(cameras)
+    if directions is None:
+        return _damped(system, right, prior.free, damping)
+    along = _damped(directions.T @ system @ directions, directions.T @ right, None, damping)
+    return None if along is None else prior.rigid(cameras, directions @ along)
 
 
 def _damped(system: Array, right: Array, free: NDArray[np.bool_] | None, damping: float) -> Array | None:

@@ -1,0 +1,121 @@
+"""Which parameters of unknown lenses the evidence supports: from a simple model to the largest that pays."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS, Camera
+from biresnerf.refinement.adjustment.adjustment import Adjustment, adjust_poses, track_term
+from biresnerf.refinement.adjustment.cameras import POSE, Cameras
+from biresnerf.refinement.adjustment.evidence import Evidence, PosePrior
+from biresnerf.refinement.adjustment.lens.lenses import FOCAL, K1, KINDS, LENS, OBSERVABLE, Lenses, posterior
+from biresnerf.refinement.adjustment.solver.solve import Prior, newton_step
+from biresnerf.refinement.adjustment.track_term import ROBUST_SCALE
+from biresnerf.refinement.finish.expected_errors import TRACK_MODEL_ERROR
+
+logger = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+
+MOST_OBSERVATIONS = 20_000  # more tell the same
+# Standard deviations, and errors that tracks share, by which a parameter must differ from a simpler lens's.
+CLEAR = 2.0
+
+
+def supported_lenses(
+    world_from_cam: Array,
+    fitted: Evidence,
+    left_out: Evidence,
+    prior: PosePrior,
+    cameras: Sequence[Camera],
+    announce: Callable[[], None],
+) -> Lenses | None:
+    """The lenses of the evidence with everything held that tracks do not support.
+
+    All start with a focal length and the first radial coefficient, where their cameras' models have it. Then the
+    principal point is freed, the radial coefficients, tangential ones and the ratio of focal lengths, one after
+    the other. Each stays free where tracks tell its value and that this is not the simpler lens's, and where tracks
+    that were left out fit better.
+    """
+    lenses = fitted.lenses
+    if lenses is None:
+        return None
+    simple = np.zeros_like(lenses.free)
+    simple[:, FOCAL], simple[:, K1] = True, ["k1" in MODEL_PARAMETERS[camera.model] for camera in cameras]
+    kept = lenses.held(~simple)
+    if not (lenses.free & ~simple).any():
+        return lenses
+    if fitted.tracks is None or left_out.tracks is None:
+        return kept
+    tracks = fitted.tracks.thinned(MOST_OBSERVATIONS, len(world_from_cam))
+    fitted, left_out = replace(fitted, tracks=tracks, patches=None), replace(left_out, patches=None)
+    best = adjust_poses(world_from_cam, replace(fitted, lenses=kept), prior)
+    for kind in KINDS:
+        tried = lenses.held(~kept.free & ~_of(kind))
+        told = _told(best, replace(fitted, lenses=tried), prior, kept)
+        if not told.any():
+            continue
+        announce()
+        tried = lenses.held(~kept.free & ~(told[:, None] & _of(kind)))
+        found = adjust_poses(world_from_cam, replace(fitted, lenses=tried), prior)
+        if found.lenses is not None and _pays(found, best, replace(left_out, lenses=tried)):
+            logger.info("lenses: parameters %s are free in %d of them", kind, told.sum())
+            kept, best = tried, found
+    return kept
+
+
+def _told(best: Adjustment, fitted: Evidence, prior: PosePrior, kept: Lenses) -> NDArray[np.bool_]:
+    """Lenses [g] with more free than is `kept` that tracks tell, and by one step would move far beyond its error."""
+    lenses = fitted.lenses
+    assert lenses is not None
+    if not best.used or best.lenses is None:
+        return np.zeros(len(lenses.free), np.bool_)
+    now = replace(lenses, correction=best.lenses.correction)
+    cameras = Cameras.of(best.world_from_cam, now)
+    term = track_term(cameras, fitted, best.track_noise_px)
+    if term is None:
+        return np.zeros(len(lenses.free), np.bool_)
+    term.settle(cameras)
+    linear = term.linearise(cameras, 0.0)
+    step = newton_step(cameras, [linear], Prior.of(prior, lenses))
+    if step is None:
+        return np.zeros(len(lenses.free), np.bool_)
+    moved = np.abs(cameras.split(step)[1])
+    deviation = posterior(linear.system, POSE * len(cameras), lenses)
+    with np.errstate(invalid="ignore"):
+        known = lenses.free & ~kept.free & (deviation < OBSERVABLE * lenses.deviation)
+        return np.asarray((known & (moved > CLEAR * TRACK_MODEL_ERROR * deviation)).any(1))
+
+
+def _pays(found: Adjustment, best: Adjustment, left_out: Evidence) -> bool:
+    """Whether points that were left out fit better, beyond chance."""
+    ours, theirs = (_misfits(each, left_out, found.track_noise_px) for each in (found, best))
+    if ours is None or theirs is None:
+        return False
+    gains = theirs - ours
+    return bool(gains.mean() > CLEAR * gains.std(ddof=1) / len(gains) ** 0.5)
+
+
+def _misfits(found: Adjustment, left_out: Evidence, noise_px: float) -> Array | None:
+    """Of each point, the robust squares of its observations in noise levels; None where there are too few points."""
+    assert found.lenses is not None
+    assert left_out.lenses is not None
+    cameras = Cameras.of(found.world_from_cam, left_out.lenses.known(found.lenses.correction))
+    term = track_term(cameras, left_out, noise_px)
+    if term is None or len(term.unknowns) < 2:
+        return None
+    term.settle(cameras)
+    square = np.minimum((term.errors_px(cameras) / noise_px) ** 2, 1e9)
+    return np.asarray(
+        np.bincount(term.point, ROBUST_SCALE**2 * square / (ROBUST_SCALE**2 + square)), np.float64
+    )
+
+
+def _of(kind: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Which parameters [8] are of a kind."""
+    return np.isin(np.arange(LENS), kind)
