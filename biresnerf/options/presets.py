@@ -40,6 +40,7 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
 }
 
 # These keep their proportion to `steps`.
+FEWEST_STEPS, FEWEST_OF_STAGE = 20, 10  # of a run, and of what follows from its length
 SCALED_BY_STEPS = ("coarse_steps_min", "coarse_steps_max", "check_every", "warmup_steps")
 
 COMMON_VALUES: dict[str, Any] = {
@@ -102,5 +103,5 @@ def in_proportion(values: Mapping[str, Any], steps: int) -> dict[str, int]:
     """What follows from so many steps in place of those that the values have."""
     ratio = steps / values["steps"]
     # In proportion, trials would be too short to distinguish good poses from better ones.
-    trial = {"trial_steps": min(values["trial_steps"], max(10, steps // 4))}
-    return {key: max(10, round(values[key] * ratio)) for key in SCALED_BY_STEPS} | trial
+    trial = {"trial_steps": min(values["trial_steps"], max(FEWEST_OF_STAGE, steps // 4))}
+    return {key: max(FEWEST_OF_STAGE, round(values[key] * ratio)) for key in SCALED_BY_STEPS} | trial

@@ -13,7 +13,15 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from biresnerf.options.formats import ExportName
 from biresnerf.options.option import ONCE, Option, all_required, divided, lowered
-from biresnerf.options.presets import ComputeDevice, MethodName, PresetName, in_proportion, preset_values
+from biresnerf.options.presets import (
+    FEWEST_OF_STAGE,
+    FEWEST_STEPS,
+    ComputeDevice,
+    MethodName,
+    PresetName,
+    in_proportion,
+    preset_values,
+)
 from biresnerf.options.validated_options import validated, with_near_names
 from biresnerf.stages import STAGES
 
@@ -127,7 +135,7 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
         "`a.jpg, b.jpg, 1.25` or `0 0 1, 2 0 1, 3.5`.",
     )
     steps: Annotated[int | Open, Option("coarse", "Steps", level="usual")] = Field(
-        OPEN, ge=20, le=1_000_000, description="Optimisation steps of both stages together."
+        OPEN, ge=FEWEST_STEPS, le=1_000_000, description="Optimisation steps of both stages together."
     )
     time_budget_s: Annotated[float, Option("coarse", "Time budget", level="main")] = Field(
         0.0,
@@ -136,10 +144,13 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
         description="Seconds the whole run may take: it does as many steps as fit; 0: no limit.",
     )
     coarse_steps_min: Annotated[int | Open, Option("coarse", "Shortest stage 1")] = Field(
-        OPEN, ge=10, le=1_000_000, description="Shortest stage 1, steps."
+        OPEN, ge=FEWEST_OF_STAGE, le=1_000_000, description="Shortest stage 1, steps."
     )
     coarse_steps_max: Annotated[int | Open, Option("coarse", "Longest stage 1")] = Field(
-        OPEN, ge=10, le=1_000_000, description="Longest stage 1, steps, even if the error is not stable."
+        OPEN,
+        ge=FEWEST_OF_STAGE,
+        le=1_000_000,
+        description="Longest stage 1, steps, even if the error is not stable.",
     )
     check_every: Annotated[int | Open, Option("coarse", "Steps between checks")] = Field(
         OPEN, ge=5, le=1_000_000, description="Steps between two checks whether the error is stable."

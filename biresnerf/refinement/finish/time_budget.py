@@ -7,6 +7,7 @@ import time
 from functools import partial
 
 from biresnerf.data.workload import FIRST_ROUND, LEARNING
+from biresnerf.options.presets import FEWEST_STEPS
 from biresnerf.refinement.finish.work_ahead import checks_ahead, expect_as_measured, work_ahead
 from biresnerf.refinement.stages.two_stages import TwoStages
 
@@ -45,8 +46,8 @@ def choose_steps(stages: TwoStages, most: int) -> None:
     """Leave a run as many steps as there is time for, `most` in all; fewer where poses stand still from now on."""
     optimiser = stages.optimiser
     before = optimiser.schedule.steps
-    high = round((FIRST_ROUND + LEARNING) * most) if optimiser.poses_held else most
-    low = min(high, max(optimiser.step_index, round(LEAST * most)))
+    high = max(FEWEST_STEPS, round((FIRST_ROUND + LEARNING) * most)) if optimiser.poses_held else most
+    low = min(high, max(optimiser.step_index, round(LEAST * most), FEWEST_STEPS))
     left_s, checks = stages.ends - time.monotonic(), checks_ahead(stages)
     while low < high:
         steps = (low + high + 1) // 2

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.data.workload import can_be_adjusted
+from biresnerf.options.presets import FEWEST_OF_STAGE
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.methods import Method, find_method
@@ -62,5 +63,10 @@ def stage_lengths(start: InitialPoses, asked: RefineOptions, resolved: ResolvedO
     if not (start.mostly_matched and find_method(resolved.method).robust_extensions):
         return resolved
     names = [n for n in ("coarse_steps_min", "coarse_steps_max") if getattr(asked, n) is None]
-    shorter = {name: round(MATCHED_COARSE_SHARE * getattr(resolved, name)) for name in names}
+    shorter = {
+        name: max(FEWEST_OF_STAGE, round(MATCHED_COARSE_SHARE * getattr(resolved, name))) for name in names
+    }
+    if "coarse_steps_max" in shorter:
+        least = shorter.get("coarse_steps_min", resolved.coarse_steps_min)
+        shorter["coarse_steps_max"] = max(least, shorter["coarse_steps_max"])
     return resolved.model_copy(update=shorter)

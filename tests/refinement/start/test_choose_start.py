@@ -11,7 +11,7 @@ from pydantic import TypeAdapter
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.errors import Interrupted
 from biresnerf.geometry.perturb import perturb_poses
-from biresnerf.options.refine_options import RefineOptions
+from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.progress import Monitor
 from biresnerf.refinement.start import choose_start as start_module
 from biresnerf.refinement.start.choose_start import choose_start, find_start
@@ -187,6 +187,16 @@ def test_stage_1_is_shorter_where_matches_placed_the_cameras_and_its_length_was_
     assert (shorter.coarse_steps_min, shorter.coarse_steps_max) == (400, 800)
     fixed = RefineOptions(preset="fast", coarse_steps_min=500, coarse_steps_max=900)
     assert stage_lengths(matched, fixed, fixed.resolved("cpu")) == fixed.resolved("cpu")
+
+
+@pytest.mark.parametrize("asked", [{}, {"coarse_steps_min": 10}, {"coarse_steps_max": 20}])
+@pytest.mark.parametrize("steps", [20, 60, 71, 100])
+def test_a_run_of_few_steps_keeps_to_the_bounds_that_its_report_is_read_by(scene, steps, asked):
+    dataset, _ = scene
+    _, matched = candidates(dataset, dataset.world_from_cam, dataset.world_from_cam)
+    options = RefineOptions(preset="fast", steps=steps, **asked)
+    shorter = stage_lengths(matched, options, options.resolved("cpu"))
+    assert ResolvedOptions.model_validate(shorter.model_dump()) == shorter
 
 
 def test_cameras_that_matches_left_out_where_they_placed_most_are_not_reliable(scene):
