@@ -168,7 +168,7 @@ def _read(path: Path, setup: _Setup) -> Dataset:
 def _seed(dataset: Dataset, setup: _Setup) -> tuple[Scene, RunOrigin]:
     """The set with initial poses for all its images: those of earlier work, else those that predict photos best."""
     options, folder, earlier, monitor = setup.options, setup.folder, setup.earlier, setup.monitor
-    rigid_bodies(dataset, options)  # refuses unknown names before anything takes time
+    bodies = rigid_bodies(dataset, options)  # refuses unknown names before anything takes time
     KnownDistance.of(options.known_distance, dataset)  # so does this
     expect_run(monitor.forecast, dataset, options)
     with SeedingPreview(dataset, folder, monitor) as preview:
@@ -180,6 +180,7 @@ def _seed(dataset: Dataset, setup: _Setup) -> tuple[Scene, RunOrigin]:
             effort=options.seeding_effort,
             remember=folder.path / SEEDING,
             on_progress=preview,
+            takes_back_offset=not bodies.tied,
         )
         preview.show_candidate(seeding)
     images = load_images(

@@ -88,8 +88,15 @@ class InputAccuracy(FrozenModel):
     position: float = Field(examples=[0.03], description="In the input's unit.")
     body_from_camera: tuple[tuple[float, float, float, float], ...] | None = Field(
         None,
-        description="Offset between the tracked body (robot hand, phone) and the camera that all poses of the input "
-        "share, 4 x 4 in the input's unit. None where the errors show none.",
+        description="Offset between the tracked body (robot hand, phone), or other axes, and the camera that all poses "
+        "of the input share, 4 x 4 in the input's unit: given @ body_from_camera are the cameras. Its shift is zero "
+        "along directions in which it is not known. None where the errors show none.",
+    )
+    body_from_camera_deviation: float | None = Field(
+        None,
+        examples=[0.002],
+        description="Standard deviation of its shift along the least certain of the known directions, in the input's "
+        "unit. None where no shift is known.",
     )
     stated_rotation_deg: float | None = Field(None, description="As stated by an option; None: not stated.")
     stated_position: float | None = Field(None, description="As stated by an option, in the input's unit.")

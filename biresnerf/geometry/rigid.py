@@ -29,29 +29,37 @@ def interpolate_pose(first: Array, second: Array, share: float) -> Array:
     """
     pose = np.eye(4)
     pose[:3, 3] = (1 - share) * first[:3, 3] + share * second[:3, 3]
-    axis, angle = _axis_angle(first[:3, :3].T @ second[:3, :3])
-    pose[:3, :3] = first[:3, :3] @ _rotation(axis, share * angle)
+    turn = rotation_vectors((first[:3, :3].T @ second[:3, :3])[None])[0]
+    pose[:3, :3] = first[:3, :3] @ rotation_of(share * turn)
     return pose
 
 
-def _axis_angle(rotation: Array) -> tuple[Array, float]:
-    """Unit axis [3] and angle in [0, pi]."""
-    twice_sine = np.array(
-        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
+def rotation_vectors(rotation: Array) -> Array:
+    """Rotation vectors [n, 3] of angle at most pi, of rotations [n, 3, 3].
+
+    From the unit quaternion, the first eigenvector of a matrix that is linear in the rotation (Bar-Itzhack 2000): exact
+    near pi as well as near zero.
+    """
+    r = np.asarray(rotation, np.float64)
+    outer = np.empty((len(r), 4, 4))
+    outer[:, 1:, 1:] = r + r.transpose(0, 2, 1)
+    trace = np.trace(r, axis1=1, axis2=2)
+    outer[:, [1, 2, 3], [1, 2, 3]] -= trace[:, None]
+    outer[:, 0, 0] = trace
+    outer[:, 0, 1:] = outer[:, 1:, 0] = np.stack(
+        [r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]], 1
     )
-    length = float(np.linalg.norm(twice_sine))
-    angle = float(np.arctan2(length, np.trace(rotation) - 1))
-    if angle > 3.0:  # the sine vanishes near pi, the symmetric part does not
-        symmetric = (rotation + rotation.T) / 2 - np.cos(angle) * np.eye(3)
-        column = symmetric[:, int(np.argmax(np.diag(symmetric)))]
-        axis = column / np.linalg.norm(column)
-        return (axis if axis @ twice_sine >= 0 else -axis), angle
-    return (twice_sine / length, angle) if length > 0 else (np.array([1.0, 0.0, 0.0]), 0.0)
+    quat_wxyz = np.linalg.eigh(outer)[1][:, :, -1]
+    quat_wxyz *= np.where(quat_wxyz[:, :1] < 0, -1.0, 1.0)
+    sine = np.linalg.norm(quat_wxyz[:, 1:], axis=1, keepdims=True)
+    angle = 2 * np.arctan2(sine, quat_wxyz[:, :1])
+    return np.asarray(np.where(sine > 0, angle / np.where(sine > 0, sine, 1.0), 2.0) * quat_wxyz[:, 1:])
 
 
-def _rotation(axis: Array, angle: float) -> Array:
-    """Rodrigues' formula."""
-    x, y, z = axis
+def rotation_of(vector: Array) -> Array:
+    """The rotation [3, 3] of a rotation vector [3], by Rodrigues' formula."""
+    angle = float(np.linalg.norm(vector))
+    x, y, z = vector / angle if angle > 0 else np.zeros(3)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     turned: Array = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
     return turned

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from biresnerf.data.model.colmap_scene import ColmapModel
 from biresnerf.errors import Fault
+from biresnerf.geometry.body_offset import BodyOffset
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.report import IntrinsicsSource, PoseSource
 
@@ -91,6 +92,7 @@ class Dataset:
         warnings: what the user should know about how it was read.
         intrinsics_sources: who found each camera's intrinsics; empty where the user gave them all.
         faults: what failed on our side, so that evidence is missing that the photos may hold.
+        body_offset: what all given poses lacked, and have now; None where nothing was found.
     """
 
     root: Path
@@ -100,6 +102,7 @@ class Dataset:
     warnings: tuple[str, ...] = ()
     intrinsics_sources: tuple[IntrinsicsSource, ...] = ()
     faults: tuple[Fault, ...] = ()
+    body_offset: BodyOffset | None = None
 
     def __post_init__(self) -> None:
         if all(by == "given" for by in self.intrinsics_sources):

@@ -168,8 +168,12 @@ def _model(
     if given is None:
         made = model_of_poses(dataset.file_names, dataset.cameras, indices, world_from_cam)
         return made, tuple(range(1, len(dataset) + 1))
+    as_read = dataset.body_offset is None
     changed = np.array(
-        [old is None or not np.array_equal(old, new) for old, new in zip(before, world_from_cam, strict=True)]
+        [
+            not (as_read and old is not None and np.array_equal(old, new))
+            for old, new in zip(before, world_from_cam, strict=True)
+        ]
     )
     moved = model_at_poses(given, dataset.names, dataset.cameras, indices, world_from_cam, changed)
     model = with_points(moved, no_points())  # the given ones belong to the poses before

@@ -1,9 +1,10 @@
-"""Models that feature matches support, carried into the frame of given poses, and believed or not."""
+"""Models that feature matches support: what given poses lack by them, and carried into their frame, believed or not."""
 
 from __future__ import annotations
 
 import importlib.util
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,9 +13,11 @@ from numpy.typing import NDArray
 from biresnerf.data.formats.positions.position_priors import position_priors
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.seeding.map_images import MappedModel
+from biresnerf.geometry.body_offset import tie
 from biresnerf.geometry.earth.georeference import NoGeoreference, fit_positions
 from biresnerf.geometry.focus import focus_point
 from biresnerf.geometry.pose_error import rotation_between_deg
+from biresnerf.geometry.rigid import rotation_vectors
 from biresnerf.geometry.similarity import align_robust
 
 logger = logging.getLogger(__name__)
@@ -27,6 +30,9 @@ STRAY_SHIFTS, STRAY_SHARE = 8.0, 0.2  # the floor is a share of the cameras' dis
 # A model with more of them is wrong as a whole (lego at 100 px: 23 of 78 stray, and the others are off by 17 deg).
 STRAY_MOST = 0.15
 JUDGED_FROM = 3  # given poses in a model; fewer tie it to their frame and say nothing of it
+OPENGL = frozenset({"nerfstudio", "instant-ngp", "blender", "bundler"})  # formats whose cameras look along -z
+AXES = ("OpenGL axes (x right, y up, z back)", "OpenCV axes (x right, y down, z forward)")
+NEARLY_DEG, NEARLY = 1.0, 0.9998  # a turn that has a name: its angle, and the cosine of its axis
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,3 +113,54 @@ def in_measured_frame(matched: MatchedPoses, dataset: Dataset) -> MatchedPoses:
     return replace(
         matched, world_from_cam=np.where(matched.placed[:, None, None], found, matched.world_from_cam)
     )
+
+
+def without_offset(dataset: Dataset, models: Sequence[MappedModel]) -> Dataset:
+    """The set with the cameras' poses in place of those of bodies that carry them, where a model shows these.
+
+    The best model tells: its frame is found with the offset, so that the given frame stays.
+    """
+    given = [frame.world_from_cam for frame in dataset.frames]
+    pairs = [
+        (here, there)
+        for model in models[:1]
+        for here, row in zip(model.world_from_cam, model.rows, strict=True)
+        if (there := given[row]) is not None
+    ]
+    found = tie(*(np.stack(rig) for rig in zip(*pairs, strict=True))) if pairs else None
+    if found is None or found.offset is None:
+        return dataset
+    body_from_cam = found.offset.body_from_cam
+    words = offset_words(body_from_cam, dataset.source.dialect)
+    logger.info("%s", words)
+    frames = tuple(
+        f if f.world_from_cam is None else replace(f, world_from_cam=f.world_from_cam @ body_from_cam)
+        for f in dataset.frames
+    )
+    return replace(dataset, frames=frames, body_offset=found.offset, warnings=(*dataset.warnings, words))
+
+
+def offset_words(body_from_cam: NDArray[np.float64], dialect: str) -> str:
+    """A warning that says what was found, by name where it is a turn that people know."""
+    vector = np.degrees(rotation_vectors(body_from_cam[None, :3, :3])[0])
+    angle, shift = float(np.linalg.norm(vector)), float(np.linalg.norm(body_from_cam[:3, 3]))
+    moved = f"shifted by {shift:.3g} units" if shift else ""
+    if _nearly(angle, 180.0) and abs(vector[0]) > angle * NEARLY:
+        expected, found = AXES if dialect in OPENGL else AXES[::-1]
+        what = f"look like {found}, where this format has {expected}"
+    elif angle and abs(vector[2]) > angle * NEARLY:
+        what = f"are rolled by {angle:.3g} degrees about the viewing axes of the cameras"
+    elif angle:
+        axis = ", ".join(f"{part:.2f}" for part in vector / angle)
+        what = f"are all turned by {angle:.3g} degrees about ({axis}) in the axes of the cameras"
+    else:
+        what, moved = f"are all {moved} in the axes of the cameras", ""
+    like = ", as those of a robot's flange, a phone or another tracked body are" if shift else ""
+    return (
+        f"The given poses {what}{f', and {moved}' if moved else ''}{like}. Feature matches show it, and it was taken "
+        "back before anything else: poses are those of the cameras now, in the input's own world."
+    )
+
+
+def _nearly(angle: float, round_number: float) -> bool:
+    return abs(angle - round_number) < NEARLY_DEG

@@ -21,7 +21,13 @@ from biresnerf.data.seeding.cached_mapping import remembered_mapping
 from biresnerf.data.seeding.compare_models import adds_to, model_lens_problem, with_found_lenses
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.data.seeding.map_images import MappedModel, Mapping
-from biresnerf.data.seeding.match_poses import MatchedPoses, can_match, carry_model, in_measured_frame
+from biresnerf.data.seeding.match_poses import (
+    MatchedPoses,
+    can_match,
+    carry_model,
+    in_measured_frame,
+    without_offset,
+)
 from biresnerf.data.seeding.missing_poses import guess_missing
 from biresnerf.data.seeding.on_turntable import even_ring
 from biresnerf.data.seeding.seeding_progress import OnSeeding
@@ -98,6 +104,7 @@ def seed_poses(
     limit_s: float | None = None,
     remember: Path | None = None,
     on_progress: OnSeeding = lambda _found: None,
+    takes_back_offset: bool = True,
 ) -> Seeding:
     """The set with a pose for every image, and the sets of poses worth starting from.
 
@@ -109,7 +116,8 @@ def seed_poses(
 
     COLMAP's threads make its answer differ a little from run to run. A run that is to be continued keeps it in the
     file ``remember``, with colmap.log beside it. ``on_progress`` is called only if
-    COLMAP does run: at once, then when more is known.
+    COLMAP does run: at once, then when more is known. What all given poses lack on the camera's side is taken back
+    first, unless they are to stay as they are (``takes_back_offset``).
 
     Raises:
         InputError: ``pose_missing``, ``colmap_missing``, ``seed_failed``, ``insufficient_overlap`` or ``seed_timeout``.
@@ -145,6 +153,8 @@ def seed_poses(
             raise
         logger.error("%s The run goes on without feature matches.", error.fault)
         return _seeding(replace(dataset, faults=(*dataset.faults, error.fault)), given.without_matches())
+    if takes_back_offset:
+        given = _Given.of(without_offset(dataset, mapping.models))
     if start == "auto" and given.posed.any():
         return _beside_given(given, mapping)
     return _from_scratch(given, mapping, start)

@@ -169,6 +169,7 @@ def compare_without_training(scene: Scene, refined: RefinedPoses, lost: int) -> 
         working_share=working_share(before, images),
         out_of_frame=frame_doubt(turned, shifted, spread) if grounded and not failed else "",
         faults=tuple(map(str, dataset.faults)),
+        offset=dataset.body_offset is not None,
     )
     return Compared(before, after, placed, turned, shifted, findings)
 

@@ -40,6 +40,7 @@ class Findings:
         out_of_frame: a sentence if the refined poses fit the input's frame only roughly, else empty.
         compared_with: where the input's poses come from.
         grounded: whether the input's poses are given ones or come from matches, and are not mere guesses.
+        offset: whether an offset that all given poses shared was taken back.
     """
 
     failed: tuple[str, ...]
@@ -51,6 +52,7 @@ class Findings:
     out_of_frame: str = ""
     faults: tuple[str, ...] = ()
     working_share: float = 1.0
+    offset: bool = False
 
     @property
     def explained(self) -> bool:
@@ -188,6 +190,10 @@ def _sentences(f: Findings) -> list[str]:
     """The figures, in words."""
     sentences = []
     before = "the poses found" if f.compared_with == "seeded" else "the input's poses"
+    if f.offset:
+        sentences.append(
+            "The input's poses are those of the cameras: an offset that all shared was taken back."
+        )
     if f.heldout is not None:
         p = f.heldout.psnr
         sentences.append(

@@ -89,7 +89,7 @@ def transforms_notes(dataset: Dataset, world_from_cam: NDArray[np.float64]) -> t
 
 def _unmoved(dataset: Dataset, index: int, world_from_cam: NDArray[np.float64]) -> bool:
     given = dataset.frames[index].world_from_cam
-    return given is not None and np.array_equal(given, world_from_cam)
+    return given is not None and dataset.body_offset is None and np.array_equal(given, world_from_cam)
 
 
 def _frame_object(
