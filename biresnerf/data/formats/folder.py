@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
@@ -10,7 +9,7 @@ from pathlib import Path
 
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.registry import ALL_CODECS
-from biresnerf.data.formats.unread_poses import refuse_unread
+from biresnerf.data.formats.unread_poses import folders_of_set, refuse_unread
 from biresnerf.data.photos.named_images import lies_in
 from biresnerf.data.photos.photo_folders import (
     IMAGE_FOLDER,
@@ -28,9 +27,6 @@ from biresnerf.errors import InputError
 
 # Folders that are part of the names of photos, also where there is nothing beside them.
 _NAMED_IN_SETS = (IMAGE_FOLDER, VIDEO_FRAMES)
-_DEPTH = 4  # of folders in which poses of a set are looked for: dslr/colmap/, dense/0/sparse/
-_MOST_FOLDERS = 2_000
-_RESULT = {"report.json", "config.json"}  # what a result of ours holds
 
 
 @dataclass(frozen=True)
@@ -198,17 +194,12 @@ def _from_set(one: _Found) -> tuple[bool, int, int, int]:
 
 
 def _folders_below(root: Path) -> list[Path]:
-    """The folders below ``root`` that may hold poses of the set, the nearest first; results of ours are none."""
-    found: list[Path] = []
-    for parent, folders, files in os.walk(root):
-        here = Path(parent)
-        if set(files) >= _RESULT or len(found) > _MOST_FOLDERS:
-            folders.clear()
-            continue
-        if here != root and (folders or not all(map(is_photo_name, files))):
-            found.append(here)
-        inner = [] if len(here.relative_to(root).parts) == _DEPTH else folders
-        folders[:] = sorted(name for name in inner if not name.startswith((".", "__")))
+    """The folders below ``root`` that may hold poses of the set, the nearest first."""
+    found = [
+        folder
+        for folder, folders, files in folders_of_set(root)
+        if folder != root and (folders or not all(map(is_photo_name, files)))
+    ]
     return sorted(found, key=lambda folder: (len(folder.parts), folder))
 
 

@@ -14,7 +14,9 @@ from biresnerf.data.formats.bind_images import dataset_of
 from biresnerf.data.formats.folder import FolderContents, look_at, look_into
 from biresnerf.data.formats.parsed_poses import ParsedPoses, PoseEntry, without_problems
 from biresnerf.data.formats.positions.position_priors import position_notes
+from biresnerf.data.formats.positions.position_table import position_files
 from biresnerf.data.formats.registry import ALL_CODECS
+from biresnerf.data.formats.unread_poses import pose_like_notes
 from biresnerf.data.model.colmap_scene import NO_POINT
 from biresnerf.data.model.dataset import Dataset, SourceFormat
 from biresnerf.data.model.image_order import natural_key
@@ -52,6 +54,8 @@ def read_dataset(
     if contents.format is None or contents.poses is None:
         images, notes = _with_video_frames(contents, within, videos)
         dataset = _read_images(contents.root, images, within, strict=strict)
+        known = position_files(contents.root)
+        notes += [] if contents.videos else pose_like_notes(contents.root, dataset.names, known)
         contents = replace(contents, notes=(*contents.notes, *notes))
     else:
         codec = ALL_CODECS[contents.format]
