@@ -53,6 +53,12 @@ class HeldOutEvidence(FrozenModel):
     )
     psnr: PairedDifference = Field(description="dB.")
     ssim: PairedDifference
+    missed_px: float | None = Field(
+        None,
+        examples=[1.3],
+        description="By how many px, at working size, the photos would have to be shifted to differ from themselves as "
+        "much as from their renders with the refined poses: the median of the views. None in older reports.",
+    )
 
 
 class EpipolarEvidence(FrozenModel):

@@ -5,7 +5,7 @@ Each SET holds true poses. It is refined from ten kinds of input (`STARTS`). Two
 name. Prints a JSON line for each run, and the counts at the end.
 
 Photos are at most 400 px for feature matching and 100 px for the field, every few views of large sets, so that a run
-takes about a minute of one core.
+takes about a minute of one core. With ``--set start=given`` there are no matches, and photos judge alone.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from benchmarks.method.seeding import shrunk, with_focal
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.formats.simple.poses_json import POSES, matrix_of, read_poses_json
 from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.model.refined_set import REFINED
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.data.seeding.seed_poses import seed_poses
 from biresnerf.errors import FaultError, InputError
@@ -43,7 +44,7 @@ STARTS = (
     "true", "matches", "noise 0.005", "noise 0.05", "noise 0.15", "noise 0.35", "tenth lost", "foreign photos",
     "wrong lens", "wrong matches",
 )  # fmt: skip
-VIEWS = 30  # of a set, at most
+VIEWS = 30
 MATCHED_PX, FIELD_PX = 400, 100
 FOREIGN = 3
 BEYOND_DEG = 5.0
@@ -135,13 +136,15 @@ def errors_deg(poses: Array, truth: Array, placed: NDArray[np.bool_]) -> Array:
     return camera_errors(carried, truth).rotation_deg
 
 
-def judged(given: Dataset, truth: Dataset, report: Report, result: Array) -> dict[str, object]:
-    """What was true and what was said of one run."""
+def judged(
+    given: Dataset, truth: Dataset, report: Report, result: Array, refined: Array
+) -> dict[str, object]:
+    """What was true and what was said of one run that returned some poses, refined ones or the given ones."""
     poses, count = truth.world_from_cam, len(truth)
     placed = given.posed[:count]
     given_poses = np.stack([f.world_from_cam for f in given.frames[:count] if f.world_from_cam is not None])
     before = errors_deg(given_poses, poses, placed)
-    after = errors_deg(result[:count], poses, placed)
+    after, found = (errors_deg(each[:count], poses, placed) for each in (result, refined))
     old, new = float(before[placed].mean()), float(after[placed].mean())
     said = report.verdict
     assert said is not None
@@ -154,8 +157,12 @@ def judged(given: Dataset, truth: Dataset, report: Report, result: Array) -> dic
         "verdict": verdict,
         "views": said.heldout.psnr.finding if said.heldout else None,
         "matches": said.epipolar.error_px.finding if said.epipolar else None,
+        "gain_db": round(said.heldout.psnr.difference, 2) if said.heldout else None,
+        "moved_px": round(said.moved_px, 2),
+        "missed_px": round(said.heldout.missed_px, 2) if said.heldout and said.heldout.missed_px else None,
         "chosen": next((c.name for c in report.candidates if c.chosen), None),
         "before_deg": round(old, 3),
+        "refined_deg": round(float(found[placed].mean()), 3),
         "after_deg": round(new, 3),
         "worst_deg": round(float(after.max()), 2),
         "wrongly_improved": verdict == "improved" and new > max(RISEN * old, old + RISEN_DEG),
@@ -179,10 +186,15 @@ def run(
     ):
         output = Path(folder) / "out"
         report = refine_poses(given, output, asked)
-        document = read_poses_json(output / POSES)
-    found = {image.name: matrix_of(image.world_from_cam) for image in document.images}
-    result = np.stack([found[image.name] for image in report.images])
-    return judged(given, truth, report, result)
+        result = poses_in(output, report)
+        refined = poses_in(output / REFINED, report) if (output / REFINED).exists() else result
+    return judged(given, truth, report, result, refined)
+
+
+def poses_in(folder: Path, report: Report) -> Array:
+    """[n, 4, 4], in the order of the report's images."""
+    found = {image.name: matrix_of(image.world_from_cam) for image in read_poses_json(folder / POSES).images}
+    return np.stack([found[image.name] for image in report.images])
 
 
 def main() -> None:
@@ -192,6 +204,7 @@ def main() -> None:
         "--foreign", type=Path, help="Where foreign photos come from; the next of SETS if left out."
     )
     parser.add_argument("--starts", default=",".join(STARTS))
+    parser.add_argument("--views", type=int, default=VIEWS, help="Of a set, at most.")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     asked = parser.parse_args()
@@ -201,7 +214,9 @@ def main() -> None:
     lines: list[dict[str, object]] = []
     with tempfile.TemporaryDirectory() as scratch:
         sets = {
-            path: small(path, Path(scratch)) for path in dict.fromkeys((*asked.sets, asked.foreign)) if path
+            path: small(path, Path(scratch), asked.views)
+            for path in dict.fromkeys((*asked.sets, asked.foreign))
+            if path
         }
         for i, path in enumerate(asked.sets):
             others = sets[asked.foreign or asked.sets[(i + 1) % len(asked.sets)]]
@@ -221,11 +236,11 @@ def main() -> None:
     )
 
 
-def small(path: Path, scratch: Path) -> Dataset:
+def small(path: Path, scratch: Path, views: int = VIEWS) -> Dataset:
     """A few views of a set, small, under names of their own."""
     truth = read_dataset(path)
     posed = tuple(frame for frame in truth.frames if frame.world_from_cam is not None)
-    every = -(-len(posed) // VIEWS)
+    every = -(-len(posed) // views)
     folder = scratch / path.name
     folder.mkdir()
     made = shrunk(replace(truth, frames=posed[::every]), MATCHED_PX, folder)

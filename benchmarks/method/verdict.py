@@ -70,6 +70,7 @@ def main() -> None:
             raise SystemExit("too few images")
         for figure in ("psnr", "ssim"):
             print(f"seed {seed}, {figure}: {getattr(found.evidence, figure).model_dump_json()}")
+        print(f"seed {seed}, missed: {found.evidence.missed_px:.2f} px")
 
 
 if __name__ == "__main__":

@@ -112,7 +112,10 @@ def judge_poses(
     found = compare_without_training(scene, refined, lost)
     heldout: HeldOutComparison | None = None
     if found.findings.moved_px >= MEASURABLE_PX:
-        effort = Effort(rounds_most=rounds_most, pictured=True, favoured=found.findings.favoured_by_matches)
+        effort = Effort(
+            rounds_most=rounds_most, pictured=True, favoured=found.findings.favoured_by_matches,
+            moved_px=found.findings.moved_px,
+        )  # fmt: skip
         heldout = compare_placed(
             found.before, found.after, scene, optimiser, found.placed | (not found.findings.grounded),
             should_stop, report, effort,

@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.refinement.views.compare_rigs import photos_tell
 from biresnerf.report import EpipolarEvidence, HeldOutEvidence, PairedDifference, Verdict, VerdictName
 
 Array = NDArray[np.float64]
@@ -144,6 +145,12 @@ def _judge(f: Findings) -> tuple[VerdictName, str]:
             "Feature matches fit the refined poses better, but by too little for poses that moved by "
             f"{f.moved_px:.3g} px.",
         )
+    if _views_are_better(f) and f.heldout is not None:
+        return (
+            "inconclusive",
+            "Unseen views fit the refined poses better, but these still miss the photos by about "
+            f"{f.heldout.missed_px:.2g} px, too much to tell poses that moved by {f.moved_px:.2g} px.",
+        )
     findings = [item.finding for item in _counted(f)]
     if findings and all(finding == "same" for finding in findings):
         return "kept_input", "The refined poses are no better than the input's by any measure."
@@ -161,11 +168,21 @@ def _counted(f: Findings) -> list[PairedDifference]:
 def _for(f: Findings) -> list[str]:
     """What speaks for the refined poses."""
     names = []
-    if f.heldout is not None and f.heldout.psnr.finding == "better":
+    if _views_are_better(f) and (_views_tell(f) or _matches_are_better(f)):
         names.append(VIEWS)
     if f.favoured_by_matches > 0:
         names.append(MATCHES)
     return names
+
+
+def _views_are_better(f: Findings) -> bool:
+    return f.heldout is not None and f.heldout.psnr.finding == "better"
+
+
+def _views_tell(f: Findings) -> bool:
+    """Whether unseen views may speak alone: poses that explain each other fit photos better, and miss them by far."""
+    missed = f.heldout.missed_px if f.heldout is not None else None
+    return missed is None or photos_tell(missed, f.moved_px)
 
 
 def _matches_are_better(f: Findings) -> bool:

@@ -18,6 +18,7 @@ from biresnerf.refinement.adjustment.paired import paired
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.views.held_out_views import ROUNDS_MOST, unseen_rounds
+from biresnerf.refinement.views.image_metrics import shift_px
 from biresnerf.refinement.views.pose_trials import PoseTrials, Trial, TrialScores, joined
 from biresnerf.report import HeldOutEvidence
 
@@ -27,6 +28,9 @@ BeforeAfter = dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]]
 SHOWN = 4  # held-out views that are rendered with either rig, to be looked at
 # Differences that matter and are larger than chance: trainings on the same poses differ by less (docs/verdict.md).
 PSNR_MATTERS, SSIM_MATTERS = 0.5, 0.01  # dB, and 1
+# Poses that photos miss by less than half of a motion are nearer to the truth than those before it: the triangle's
+# inequality. Short trainings blur, and so miss by up to so much at true poses (px at working size, docs/verdict.md).
+NEARER, BLUR_PX = 0.5, 2.0
 # Before the end of a training chance is larger, as its rates have not fallen yet: 0.3 dB.
 EARLY = 2  # times what matters
 
@@ -60,6 +64,7 @@ class Effort:
         looks: shares of a training after which fields are compared; the last is 1.
         pictured: whether some held-out views are rendered with either rig, to be looked at.
         favoured: the rig that other evidence favours: 1 the second, -1 the first, 0 none.
+        moved_px: how far the scene moves in the image between the rigs, where that is of account.
     """
 
     times: int = 1
@@ -67,6 +72,7 @@ class Effort:
     looks: tuple[float, ...] = LOOKS
     pictured: bool = False
     favoured: Literal[-1, 0, 1] = 0
+    moved_px: float = np.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,8 +135,11 @@ def compare_on_unseen_views(
                 report((done + look * (side + 1) / len(running)) / (done + max(look, enough)))
             scores = tuple(trial.scores() for trial in running)
             old, new = (joined(side) for side in zip(*earlier, scores, strict=True))
-            evidence = _evidence(old, new, running[0].optimiser.step_index, len(set(seen) & set(held_out)))
-            decided = _decided(evidence, EARLY if look < 1 else 1, effort.favoured)
+            strictly = len(set(seen) & set(held_out))
+            evidence = _evidence(
+                old, new, running[0].optimiser.step_index, strictly, _missed_px(new, images, seen)
+            )
+            decided = _decided(evidence, EARLY if look < 1 else 1, effort)
             if pictured and (decided or look == 1):
                 renders = _pictures(running, [view for view in views if view in held_out][:SHOWN], enough)
             did = work + sum(trial.work for trial in running)
@@ -149,23 +158,44 @@ def _pictures(pair: Sequence[Trial], views: Sequence[int], share: float) -> Befo
     return {view: (pair[0].render(view), pair[1].render(view)) for view in views}
 
 
-def _evidence(before: TrialScores, after: TrialScores, steps: int, strictly: int) -> HeldOutEvidence:
+def _missed_px(scores: TrialScores, images: ImageSet, views: Sequence[int]) -> float:
+    """Of the median view."""
+    photos = ((images.image(view).astype(np.float32) / 255, images.counts_image(view)) for view in views)
+    return float(np.median([shift_px(db, *photo) for db, photo in zip(scores.psnr, photos, strict=True)]))
+
+
+def photos_tell(missed_px: float, moved_px: float) -> bool:
+    """Whether renders with the refined poses are near enough to the photos to tell poses that differ by a motion."""
+    return missed_px <= max(BLUR_PX, NEARER * moved_px)
+
+
+def _evidence(
+    before: TrialScores, after: TrialScores, steps: int, strictly: int, missed_px: float
+) -> HeldOutEvidence:
     psnr, ssim = (
         paired(before.psnr, after.psnr, PSNR_MATTERS),
         paired(before.ssim, after.ssim, SSIM_MATTERS),
     )
-    return HeldOutEvidence(steps=steps, strictly=strictly, psnr=psnr, ssim=ssim)
+    return HeldOutEvidence(steps=steps, strictly=strictly, psnr=psnr, ssim=ssim, missed_px=missed_px)
 
 
-def _decided(evidence: HeldOutEvidence, times: float, favoured: int) -> bool:
+def _decided(evidence: HeldOutEvidence, times: float, effort: Effort) -> bool:
     """Whether both intervals lie beyond so many times what matters, on the same side; or beyond 0, on the favoured one.
 
-    Other views, or more steps, would hardly change that.
+    Other views, or more steps, would hardly change that. They may where a gain is not enough to tell yet.
     """
+    missed = evidence.missed_px
     both = ((evidence.psnr, PSNR_MATTERS), (evidence.ssim, SSIM_MATTERS))
     for side in (1, -1):
         nearest = [found.low if side > 0 else found.high for found, _ in both]
-        beyond = 0 if side == favoured else times
+        if (
+            side > 0
+            and effort.favoured <= 0
+            and missed is not None
+            and not photos_tell(missed, effort.moved_px)
+        ):
+            continue
+        beyond = 0 if side == effort.favoured else times
         if all(
             end is not None and side * end > beyond * matters
             for end, (_, matters) in zip(nearest, both, strict=True)

@@ -1,14 +1,17 @@
-"""PSNR and SSIM of images in [0, 1]."""
+"""PSNR and SSIM of images in [0, 1], and what a PSNR is worth in px."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
+SHIFTS = (1, 2, 3, 4, 6, 8, 12, 16)  # px
 
 
 def psnr(image: Tensor, reference: Tensor, counts: Tensor | None = None) -> float:
@@ -58,3 +61,27 @@ def ssim(image: Tensor, reference: Tensor, counts: Tensor | None = None) -> floa
     if not bool(inner.any()):
         inner = torch.ones_like(inner)
     return float((luminance * structure * inner).sum() / inner.sum())
+
+
+def shift_px(error_db: float, photo: NDArray[np.float32], counts: NDArray[np.bool_] | None = None) -> float:
+    """By how many px a photo [h, w, 3] has to be shifted to differ from itself by such a PSNR: `SHIFTS[-1]` at most.
+
+    It puts an error of colours in terms of a motion in the image. The blur of a render counts as well, so that a motion
+    is overrated rather than underrated.
+    """
+    shifts = [shift for shift in SHIFTS if 2 * shift < min(photo.shape[:2])]
+    errors = [_error_shifted(photo, shift, counts) ** 0.5 for shift in shifts]
+    # Of a pattern that repeats, or beyond the size of things, photos shifted further may differ less.
+    return float(np.interp(10 ** (-error_db / 20), np.maximum.accumulate([0.0, *errors]), [0, *shifts]))
+
+
+def _error_shifted(photo: NDArray[np.float32], shift: int, counts: NDArray[np.bool_] | None) -> float:
+    """Mean squared difference from itself, shifted along the rows and along the columns."""
+    errors = []
+    for axis in (0, 1):
+        one, other = (np.arange(photo.shape[axis] - shift) + start for start in (0, shift))
+        squared = (photo.take(one, axis) - photo.take(other, axis)) ** 2
+        if counts is not None:
+            squared = squared[counts.take(one, axis) & counts.take(other, axis)]
+        errors.append(float(squared.mean()) if squared.size else 0.0)
+    return float(np.mean(errors))

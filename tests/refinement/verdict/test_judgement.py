@@ -65,6 +65,13 @@ def test_true_poses_in_place_of_noisy_ones_are_an_improvement(scene, noisy):
     assert verdict.heldout.strictly == 1
 
 
+def test_true_poses_miss_the_photos_by_less_than_wrong_ones(scene):
+    truth = scene[0].world_from_cam
+    noisy, other = (perturb_poses(truth, 0.3, seed=seed) for seed in (1, 2))
+    right, wrong = (judged(scene, noisy, refined).verdict.heldout.missed_px for refined in (truth, other))
+    assert right < compare_rigs.BLUR_PX < wrong
+
+
 def test_other_views_are_left_out_only_until_they_decide(scene):
     truth = scene[0].world_from_cam
     first, second = unseen_rounds(VIEWS, [3])

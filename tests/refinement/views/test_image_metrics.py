@@ -7,7 +7,7 @@ import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from biresnerf.refinement.views.image_metrics import psnr, ssim
+from biresnerf.refinement.views.image_metrics import psnr, shift_px, ssim
 
 
 def pair(height: int, width: int, noise: float) -> tuple[np.ndarray, np.ndarray]:
@@ -34,6 +34,26 @@ def test_both_equal_scikit_image(height, width, noise):
         use_sample_covariance=False,
     )
     assert ssim(torch.from_numpy(image), torch.from_numpy(photo)) == pytest.approx(theirs, abs=1e-6)
+
+
+@pytest.mark.parametrize("shift", [1, 2, 3, 6])
+def test_a_psnr_is_worth_the_shift_that_makes_it(shift):
+    photo = pair(48, 64, 0.02)[0].astype(np.float32)
+    aside, down = (psnr(*map(torch.from_numpy, (a, b))) for a, b in (
+        (photo[:, shift:], photo[:, :-shift]), (photo[shift:], photo[:-shift])
+    ))  # fmt: skip
+    error_db = -10 * np.log10((10 ** (-aside / 10) + 10 ** (-down / 10)) / 2)
+    assert shift_px(error_db, photo) == pytest.approx(shift, rel=0.01)
+    assert shift_px(120, photo) == pytest.approx(0, abs=1e-3)
+    assert shift_px(0, photo) == 16
+
+
+def test_pixels_that_do_not_count_say_nothing_of_a_shift():
+    photo = pair(48, 64, 0.02)[0].astype(np.float32)
+    counts = np.ones(photo.shape[:2], np.bool_)
+    counts[10:30, 20:50] = False
+    spoilt = np.where(counts[..., None], photo, np.float32(7))
+    assert shift_px(20, spoilt, counts) == pytest.approx(shift_px(20, photo, counts))
 
 
 def test_identical_images_give_the_best_values():
