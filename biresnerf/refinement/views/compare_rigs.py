@@ -160,8 +160,11 @@ def _pictures(pair: Sequence[Trial], views: Sequence[int], share: float) -> Befo
 
 def _missed_px(scores: TrialScores, images: ImageSet, views: Sequence[int]) -> float:
     """Of the median view."""
-    photos = ((images.image(view).astype(np.float32) / 255, images.counts_image(view)) for view in views)
-    return float(np.median([shift_px(db, *photo) for db, photo in zip(scores.psnr, photos, strict=True)]))
+    missed = []
+    for view, error_db in zip(views, scores.psnr.tolist(), strict=True):
+        photo: NDArray[np.float32] = images.image(view).astype(np.float32) / np.float32(255)
+        missed.append(shift_px(error_db, photo, images.counts_image(view)))
+    return float(np.median(missed))
 
 
 def photos_tell(missed_px: float, moved_px: float) -> bool:
