@@ -17,7 +17,13 @@ from biresnerf.data.model.pose_validation import refuse_coinciding
 from biresnerf.data.photos.guessed_lens import guess_note
 from biresnerf.data.photos.masks import mask_beside, mask_notes
 from biresnerf.data.photos.named_images import refuse_outside, refuse_too_few
-from biresnerf.data.photos.photo_folders import few_names, photos_beside, photos_named, refuse_no_images
+from biresnerf.data.photos.photo_folders import (
+    few_names,
+    photos_beside,
+    photos_named,
+    refuse_no_images,
+    with_named,
+)
 from biresnerf.data.photos.shear import shear_notes
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
@@ -36,6 +42,7 @@ def bind_images(parsed: ParsedPoses, root: Path, within: Path | None = None) -> 
     files = photos_beside(root, parsed.photo_folders)
     if named and not files:
         files = photos_named(root, [entry.name for entry in parsed.entries])
+    files = with_named(files, root, (entry.name for entry in parsed.entries)) if named else files
     refuse_no_images(files, root)
     names = sorted(files, key=natural_key)
     assign = parsed.assign or partial(by_name, parsed.entries, strict=parsed.strict)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import posixpath
+import re
 import unicodedata
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -26,7 +27,8 @@ def match_files(
 
     The same path, below images/ or with it; else, where one name and one file alone share it, the same in another
     Unicode form, then the same end of the path (as from another machine), then the same file name in another folder,
-    then with letters of another case, then with another extension; or by ``rules`` instead of these.
+    then with letters of another case, then with another extension, then with more zeros before numbers; or by
+    ``rules`` instead of these.
     """
     found: dict[str, str] = {}
     free = set(files)
@@ -82,6 +84,12 @@ _RULES: tuple[Rule, ...] = (
     ("by file name, whatever its case", lambda name: posixpath.basename(_normal(name)).casefold()),
     ("by file name without extension", lambda name: PurePosixPath(_normal(name)).stem.casefold()),
     ("by path without extension", lambda name: posixpath.splitext(_normal(name))[0]),
+    (
+        "by file name, with numbers compared as numbers",
+        lambda name: re.sub(
+            r"\d+", lambda found: str(int(found[0])), PurePosixPath(_normal(name)).stem.casefold()
+        ),
+    ),
 )
 
 

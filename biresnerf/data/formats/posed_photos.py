@@ -88,7 +88,13 @@ def _sound_camera(entry: PoseEntry, header: ImageHeader) -> FrameCamera:
     if header.equirectangular and (found.source != "given" or header.width == 2 * header.height):
         raise panorama("its metadata say that it is equirectangular", entry.name)
     if found.source != "given":
-        return found
+        if header.width != 2 * header.height:
+            return found
+        note = (
+            "photos of twice their height in width may be panoramas, which are not supported: they are taken for "
+            "perspective ones"
+        )
+        return found._replace(notes=(*found.notes, note))
     refuse_other_units(found.camera, entry.where)
     return found._replace(notes=(*found.notes, *lens_doubts(found.camera, header)))
 

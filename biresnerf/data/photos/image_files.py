@@ -127,7 +127,9 @@ def images_called(folder: Path, name: str) -> list[Path]:
                     if candidate.is_file():
                         found.setdefault(suffix, candidate)
             if len(found) > 1:
-                return sorted(found.values(), key=lambda one: (is_grey(one), one.suffix.lower() not in _JPEG))
+                return sorted(
+                    found.values(), key=lambda one: (greyness(one), one.suffix.lower() not in _JPEG)
+                )
             if found:
                 return list(found.values())
     except (OSError, ValueError):  # a name too long for the file system, or one of dots only
@@ -135,13 +137,21 @@ def images_called(folder: Path, name: str) -> list[Path]:
     return []
 
 
-def is_grey(path: Path) -> bool:
-    """Whether a picture can be opened and has one channel, as masks and depth maps have."""
+def greyness(path: Path) -> int:
+    """2 for a picture of one channel, as masks and depth maps are, 1 for one that shows no colours, else 0.
+
+    It may be decoded.
+    """
     try:
         with quiet_pillow(), open_image(path, path.name) as image:
-            return image.mode in ("1", "L", "F") or image.mode.startswith("I")
+            if image.mode in ("1", "L", "LA", "F") or image.mode.startswith("I"):
+                return 2
+            red, green, blue = image.convert("RGB").split()
+            return int(red.tobytes() == green.tobytes() == blue.tobytes())
     except InputError:
-        return False
+        return 0
+    except DAMAGED:
+        return 0
 
 
 def open_image(path: Path, name: str) -> Image.Image:

@@ -11,7 +11,7 @@ from itertools import islice
 from pathlib import Path
 
 from biresnerf.data.model.image_order import natural_key
-from biresnerf.data.photos.image_files import is_grey, is_image_name
+from biresnerf.data.photos.image_files import greyness, is_image_name
 from biresnerf.data.photos.kinds.photo_kinds import INSTALL, KIND_OF, PHOTO_KINDS, is_readable
 from biresnerf.data.photos.video.ffmpeg_frames import DEMUXERS
 from biresnerf.errors import InputError
@@ -26,27 +26,29 @@ _MAPS = frozenset(
     {
         "mask",
         "masks",
+        "matte",
+        "alpha",
         "depth",
         "depths",
         "depthmap",
         "depthmaps",
         "disparity",
+        "disp",
         "conf",
+    }
+    | {
         "confidence",
         "normal",
         "normals",
-    }
-    | {
         "semantic",
         "semantics",
         "segmentation",
+        "seg",
+        "instance",
         "label",
         "labels",
-        "thumb",
-        "thumbs",
-        "thumbnail",
-        "thumbnails",
     }
+    | {"flow", "albedo", "roughness", "thumb", "thumbs", "thumbnail", "thumbnails", "preview"}
 )
 # Other folders whose pictures are not the set's photos; `biresnerf convert` writes pinhole/.
 _NO_PHOTOS = frozenset({"pinhole", "sparse", "sparse_txt", "__macosx"})
@@ -141,6 +143,21 @@ def _bare(name: str) -> str:
     return posixpath.splitext(name.replace("\\", "/").casefold())[0]
 
 
+def with_named(files: dict[str, Path], root: Path, names: Iterable[str]) -> dict[str, Path]:
+    """The photos of ``root`` or its images/, with those that poses name in place of what `doubled` prefers to them."""
+    wanted, files = list(names), dict(files)
+    asked = set(wanted)
+    twins = {(path.parent, path.stem.casefold()): key for key, path in files.items() if key not in asked}
+    for name in asked - files.keys():
+        for place in (root / IMAGE_FOLDER / name, root / name):
+            key = twins.get((place.parent, place.stem.casefold()))
+            if key in files and is_image_name(place) and place.is_file():
+                del files[key]
+                files[name] = place
+                break
+    return files
+
+
 def folders_of_photos(root: Path) -> dict[str, list[Path]]:
     """The photos below each folder of ``root``, but folders that hold no photos."""
     folders = [path for path in visible(root) if path.is_dir() and not _holds_no_photos(path.name)]
@@ -231,8 +248,8 @@ def doubled(paths: Iterable[Path]) -> dict[Path, Path]:
     found: dict[Path, Path] = {}
     for group in same.values():
         plain = [path for path in group if not _preference(path)]
-        grey = {path for path in plain if is_grey(path)} if len(plain) > 1 else set()
-        grey = set() if len(grey) == len(plain) else grey
+        levels = {path: greyness(path) for path in plain} if len(plain) > 1 else {}
+        grey = {path for path, level in levels.items() if level > min(levels.values())}
         first = min(group, key=lambda path: (path in grey, _preference(path)))
         found |= {path: first for path in group if path != first and (path in grey or _preference(path))}
     return found

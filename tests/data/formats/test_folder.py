@@ -9,6 +9,7 @@ import pytest
 from biresnerf.data.formats.folder import look_into
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.errors import InputError
+from tests.data.formats.simple import trajectories
 from tests.data.scenes import assert_complete, blender_scene, nerfstudio_scene, save, write_image
 
 
@@ -92,6 +93,19 @@ def test_a_file_in_no_form_that_is_read_is_refused(tmp_path, name):
     with pytest.raises(InputError) as caught:
         read_dataset(tmp_path / name)
     assert_complete(caught.value, "input_unsupported", name)
+
+
+def test_poses_find_photos_whose_numbers_have_other_zeros(tmp_path):
+    names = ("frame_0008.png", "frame_0009.png", "frame_0010.png", "frame_0011.png")
+    trajectories.colmap_set(tmp_path, names)
+    for name in names:
+        (tmp_path / "images" / name).rename(
+            tmp_path / "images" / name.replace("_00", "_0").replace("_00", "_").replace("_0", "_")
+        )
+    dataset = read_dataset(tmp_path)
+    assert [frame.path.stem for frame in dataset.frames] == ["frame_8", "frame_9", "frame_10", "frame_11"]
+    trajectories.assert_at_truth(dataset)
+    assert any("numbers compared as numbers" in text for text in dataset.warnings)
 
 
 @pytest.mark.parametrize("folders", [("rgb",), ("color", "other"), ("image_2", "image_3"), ("cam0", "cam1")])

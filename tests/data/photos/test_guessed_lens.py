@@ -148,6 +148,12 @@ def test_panoramas_are_refused_and_what_to_do_with_them_is_said(tmp_path, suffix
     assert "perspective views" in caught.value.hint
 
 
+def test_photos_of_a_panoramas_shape_are_said(tmp_path):
+    for number in range(3):
+        Image.new("RGB", (80, 40), (number, 9, 9)).save(tmp_path / f"{number}.jpg")
+    assert any("may be panoramas" in text for text in read_dataset(tmp_path).warnings)
+
+
 def test_one_panorama_among_photos_is_left_out(tmp_path):
     for number in range(4):
         Image.new("RGB", (80, 40), (number, 9, 9)).save(

@@ -12,6 +12,7 @@ from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.photos.image_files import find_image
 from biresnerf.data.photos.photo_folders import images_in
 from biresnerf.errors import InputError
+from tests.data.formats.simple import trajectories
 from tests.data.scenes import nerfstudio_scene, save
 
 
@@ -62,6 +63,30 @@ def test_a_grey_picture_beside_a_photo_of_its_name_is_not_taken_for_it(tmp_path)
     assert [path.name for path in images_in(tmp_path)] == ["1.jpg", "2.png", "3.jpg", "3.png", "4.jpg"]
     for name, file in (("1", "1.jpg"), ("2", "2.png"), ("3", "3.jpg"), ("4", "4.jpg")):
         assert find_image(tmp_path, name) == tmp_path / file
+
+
+def test_a_mask_saved_in_colours_is_no_photo_either(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 256, (20, 30, 3), dtype=np.uint8)
+    for name in ("1.jpg", "2.jpg", "3.jpg", "3.png"):
+        Image.fromarray(noise).save(tmp_path / name)
+    for name, mode in (("1.png", "RGB"), ("2.png", "RGBA")):
+        Image.fromarray(noise[..., 0]).convert(mode).save(tmp_path / name)
+    assert [path.name for path in images_in(tmp_path)] == ["1.jpg", "2.jpg", "3.jpg", "3.png"]
+
+
+@pytest.mark.parametrize("form", ["colmap", "metashape"])
+def test_poses_that_name_the_grey_one_of_two_pictures_get_it(tmp_path, form):
+    trajectories.write_set(form, tmp_path)
+    for path in list((tmp_path / "images").iterdir()):
+        picture = Image.open(path)
+        picture.convert("L").save(path)
+        Image.merge(
+            "RGB", (picture.convert("L"), Image.new("L", picture.size), Image.new("L", picture.size))
+        ).save(path.with_suffix(".jpg"))
+    suffix = ".png" if form == "colmap" else ".jpg"  # Metashape's labels have none
+    assert [frame.path.name for frame in read_dataset(tmp_path).frames] == [
+        f"{one}{suffix}" for one in "abcd"
+    ]
 
 
 def test_a_name_without_extension_that_fits_two_files_is_said(tmp_path):

@@ -21,6 +21,7 @@ from biresnerf.data.photos.photo_folders import (
     images_beside,
     photos_named,
     refuse_no_images,
+    with_named,
 )
 from biresnerf.errors import InputError
 
@@ -63,6 +64,7 @@ def bind_colmap(parsed: ParsedPoses, root: Path, within: Path | None = None) -> 
     elsewhere = {entry.name: root / entry.name for entry in parsed.entries if entry.name not in files}
     files |= {name: path for name, path in elsewhere.items() if path.is_file()}
     names = [entry.name for entry in parsed.entries]
+    files = with_named(files, root, names)
     if not match_files(names, list(files))[0]:
         files = photos_named(root, names)
     refuse_no_images(files, root)

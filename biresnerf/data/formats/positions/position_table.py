@@ -72,8 +72,9 @@ def read_position_table(file: Path) -> PositionTable:
         InputError: ``positions_invalid``, with the line.
     """
     lines = read_text(file).splitlines()
-    if lines and re.match(r"\s*(EPSG:|WGS84 UTM|'?\+proj)", lines[0], re.I):
-        return _geo_txt(file.name, lines)
+    blank = next((index for index, line in enumerate(lines) if line.strip()), 0)
+    if lines and re.match(r"\s*(EPSG:|WGS84 UTM|'?\+proj)", lines[blank], re.I):
+        return _geo_txt(file.name, lines, blank)
     said = next((line for line in lines if "coordinatesystem" in line.lower().replace(" ", "")), "")
     header, rows = _header_and_rows(file.name, lines)
     longitudes = "xlongitude" in _plain(lines)
@@ -96,11 +97,11 @@ def read_position_table(file: Path) -> PositionTable:
     return PositionTable(file.name, places, degrees, epsg)
 
 
-def _geo_txt(source: str, lines: Sequence[str]) -> PositionTable:
+def _geo_txt(source: str, lines: Sequence[str], first: int) -> PositionTable:
     """OpenDroneMap's: a frame, then names, x (or longitude), y (or latitude), perhaps height, angles and accuracies."""
     rows: dict[int, list[str]] = {}
     flat: list[int] = []
-    for number, line in enumerate(lines[1:], 2):
+    for number, line in enumerate(lines[first + 1 :], first + 2):
         cells = line.split()
         if not cells or cells[0].startswith("#"):
             continue
@@ -110,7 +111,7 @@ def _geo_txt(source: str, lines: Sequence[str]) -> PositionTable:
             flat.append(number)
         else:
             rows[number] = cells
-    degrees, metres, epsg = _frame_of(lines[0], list(rows.values()), f"{source} line 1")
+    degrees, metres, epsg = _frame_of(lines[first], list(rows.values()), f"{source} line {first + 1}")
     places: dict[str, MeasuredPlace] = {}
     for number, cells in rows.items():
         where = f"{source} line {number}"
@@ -131,7 +132,7 @@ def _frame_of(header: str, rows: Sequence[Sequence[str]], where: str) -> tuple[b
     It is ``EPSG:n``, ``WGS84 UTM 32N`` or a string of PROJ. Of the geographic ones among EPSG's numbers few are known
     here: others are those whose coordinates are all small, as nobody takes photos at a projection's origin.
     """
-    if found := re.fullmatch(r"\s*EPSG:(\d{4,6})\s*", header, re.I):
+    if found := re.fullmatch(r"\s*EPSG:\s*(\d{4,6})\s*", header, re.I):
         number = int(found[1])
         if number in _DEGREES:
             return True, 1.0, WGS84 if number == 4326 else number

@@ -90,6 +90,7 @@ def test_a_bad_table_is_refused_with_the_line_and_what_to_write(tmp_path: Path, 
     ("header", "row", "degrees", "epsg", "place"),
     [
         ("EPSG:4258", "11.5 48.1 520", True, 4258, (48.1, 11.5, 520)),
+        ("\n \nEPSG: 4258", "11.5 48.1 520", True, 4258, (48.1, 11.5, 520)),
         ("epsg:4269", "11.5 48.1 520", True, 4269, (48.1, 11.5, 520)),
         ("EPSG:4171", "11.5 48.1 520", True, 4171, (48.1, 11.5, 520)),
         ("EPSG:9057", "-70.5 -48.1 520", True, 9057, (-48.1, -70.5, 520)),
