@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from biresnerf.data.formats.read_dataset import read_dataset
 from tests.data.scenes import arc_poses
 
 DOCUMENTED = Path(__file__).parents[1] / "docs" / "field.md"
-LENS = {
+LENS: dict[str, Any] = {
     "model": "OPENCV",
     "width": 64,
     "height": 48,

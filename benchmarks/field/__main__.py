@@ -25,6 +25,9 @@ def main() -> None:
     parser.add_argument("--preset", default="fast")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--url", help="A service that gets each set as well.")
+    parser.add_argument(
+        "--keep", action="store_true", help="Do not repeat runs of the product that are done."
+    )
     parser.add_argument("--table", action="store_true", help="Only print the table.")
     options = parser.parse_args()
     if not (data := os.environ.get("BIRESNERF_FIELD_DATA")):
@@ -35,7 +38,9 @@ def main() -> None:
     rows = Path(data) / "rows"
     rows.mkdir(parents=True, exist_ok=True)
     settings = [part for setting in options.set for part in ("--set", setting)]
-    asked = Asked(Path(data), options.photos, ("--preset", options.preset, *settings), options.url)
+    asked = Asked(
+        Path(data), options.photos, ("--preset", options.preset, *settings), options.url, options.keep
+    )
     chosen = [each for each in listed if each.name in options.sets] if options.sets else [
         each for each in listed if each.held_back == options.held_back
     ]  # fmt: skip

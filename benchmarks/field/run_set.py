@@ -26,16 +26,25 @@ NICE = ("nice", "-n", "10")
 
 @dataclass(frozen=True)
 class Asked:
-    """How the battery runs: the folder of clones, photos of a set at most, options of the product, a service."""
+    """How the battery runs.
+
+    Attributes:
+        data: the folder of clones and results.
+        photos: of a set, at most.
+        options: of the product, as on its command line.
+        url: of a service that gets the set as well.
+        keep: takes the product's results that are there, in place of new ones.
+    """
 
     data: Path
     photos: int | None
     options: tuple[str, ...]
     url: str | None
+    keep: bool
 
 
 def run_set(field_set: FieldSet, asked: Asked) -> Row:
-    """A row of the table. What is done already, in the folder ``data``/work/NAME, is not done again."""
+    """A row of the table. COLMAP's part is done once; results lie in ``data``/work/NAME."""
     source, work = lay_out(field_set, asked.data), asked.data / "work" / field_set.name
     names = field_set.photos[: asked.photos]
     colmap = _placed_by_colmap(source, names, work / "colmap")
@@ -136,21 +145,24 @@ def poses_of(frames: list[Row]) -> dict[str, Array]:
 
 def _refined(folder: Path, out: Path, asked: Asked, judge: Judge, url: str | None) -> Row:
     """What the product makes of a folder by `refine`, or by `submit` where a service has the ``url``."""
+    if asked.keep and (out / "report.json").is_file():
+        return _read(out, judge)
     shutil.rmtree(out, ignore_errors=True)
     program = str(Path(sys.executable).with_name("biresnerf"))
     where = ["submit", str(folder), "--url", url] if url else ["refine", str(folder)]
-    began = time.monotonic()
     ended = subprocess.run(
         [*NICE, program, *where, "-o", str(out), *asked.options, "--json"],
         capture_output=True, text=True, check=False, env=os.environ,
     )  # fmt: skip
-    row: Row = {"seconds": round(time.monotonic() - began), "code": ended.returncode}
-    report = out / "report.json"
-    if ended.returncode != 0 or not report.is_file():
-        return row | {"error": (ended.stderr or ended.stdout).strip()[-600:]}
-    found = json.loads(report.read_text("utf-8"))
+    if ended.returncode != 0 or not (out / "report.json").is_file():
+        return {"code": ended.returncode, "error": (ended.stderr or ended.stdout).strip()[-600:]}
+    return _read(out, judge)
+
+
+def _read(out: Path, judge: Judge) -> Row:
+    report = json.loads((out / "report.json").read_text("utf-8"))
     poses = {Path(name).name: pose for name, pose in read_poses(out / "transforms.json").items()}
-    return row | said(found) | judge.of(poses, out / "colmap" / "sparse" / "0")
+    return said(report) | judge.of(poses, out / "colmap" / "sparse" / "0")
 
 
 def said(report: Row) -> Row:
@@ -158,6 +170,7 @@ def said(report: Row) -> Row:
     images = report["images"]
     known = [image for image in images if (image["uncertainty"] or {}).get("rotation_deg") is not None]
     return {
+        "seconds": round(sum(report["seconds"].values())),
         "images": len(images),
         "placed": sum(image["pose_source"].startswith(("matches", "colmap")) for image in images),
         "known": len(known),

@@ -20,7 +20,7 @@ def _line(row: Row) -> tuple[str, ...]:
     width, height = row["size"]
     runs = [row.get(name) for name in ("alone", "noisy")]
     warnings = [str(len(run["warnings"])) if run and "warnings" in run else "-" for run in runs]
-    seconds = [str(run["seconds"]) if run else "-" for run in runs]
+    seconds = [str(run.get("seconds", "-")) if run else "-" for run in runs]
     return (
         f"{row['set']}: {row['kind']}",
         f"{row['photos']} of {width} x {height}",
