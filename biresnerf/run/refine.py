@@ -14,6 +14,7 @@ from biresnerf.openmp import let_waiting_threads_sleep
 from biresnerf.options.refine_options import parse_options
 from biresnerf.progress import OnProgress, told_before_the_run
 from biresnerf.result import Result, load
+from biresnerf.run.photos_added import joined_to
 from biresnerf.run.show_progress import ShownProgress
 from biresnerf.run.stop_request import StopRequest
 
@@ -26,6 +27,7 @@ def refine(
     progress: bool | OnProgress = False,
     should_stop: Callable[[], bool] | None = None,
     overwrite: bool = False,
+    fixed_from: str | Path | None = None,
     **options: Any,
 ) -> Result:
     """Refine the camera poses of an image set, as the command ``biresnerf refine`` does.
@@ -40,6 +42,7 @@ def refine(
             neither a notebook nor a terminal. A function is called with a `Progress` a few times a second.
         should_stop: asked after every step, view, frame and photo; once true, a checkpoint and a partial result are
             written. Without it, Ctrl-C asks for the same, as does a notebook's stop button.
+        fixed_from: a finished result of some of the photos: these keep its poses and lenses, and the others join them.
         overwrite: remove a finished result from `output` first.
         options: of the refinement, by name, as docs/options.md lists them: ``preset="fast", steps=2000``.
 
@@ -61,6 +64,11 @@ def refine(
         watch = told_before_the_run(on_progress or (lambda _progress: None), stop)
         videos = VideoReading(asked.video_frames, watch)
         dataset = read_dataset(Path(input), strict=asked.bad_frames == "refuse", videos=videos)
+        if fixed_from is not None:
+            dataset, known = joined_to(dataset, Path(fixed_from))
+            asked = asked.model_copy(
+                update={"fixed": (*asked.fixed, *(n for n in known if n not in asked.fixed))}
+            )
         from biresnerf.pipeline import refine_poses  # loads torch, which takes seconds
 
         refine_poses(dataset, output, asked, on_progress, stop, overwrite=overwrite)

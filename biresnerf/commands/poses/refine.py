@@ -31,6 +31,10 @@ from biresnerf.viewer.report_html import REPORT_HTML
 @click.option("--seed", type=int, default=None, help="Default: 0.")
 @budget_option
 @settings_option
+@click.option(
+    "--fixed-from", type=click.Path(path_type=Path),
+    help="A finished result of some of the photos: they keep its poses and lenses, and the others join its frame.",
+)  # fmt: skip
 @click.option("--overwrite", is_flag=True, help="Replace a finished result in OUT.")
 @click.option("--open", "open_report", is_flag=True, help="Open OUT/report.html in a browser at the end.")
 @click.option("--view", is_flag=True, help="Show the cameras in the browser while they move; needs viser.")
@@ -44,6 +48,7 @@ def refine_command(
     seed: int | None,
     time_budget_s: float | None,
     settings: dict[str, Any],
+    fixed_from: Path | None,
     overwrite: bool,
     open_report: bool,
     view: bool,
@@ -69,7 +74,13 @@ def refine_command(
             click.echo(f"view at {live.url}", err=True)
         try:
             result = refine(
-                input_path, output, progress=True, should_stop=stop, overwrite=overwrite, **options
+                input_path,
+                output,
+                progress=True,
+                should_stop=stop,
+                overwrite=overwrite,
+                fixed_from=fixed_from,
+                **options,
             )
         except Interrupted as interrupted:
             click.echo(str(interrupted), err=True)

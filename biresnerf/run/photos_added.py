@@ -1,0 +1,74 @@
+"""Photos added to those of a finished result: these keep their poses and lenses, and the new ones join their frame."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from biresnerf.data.formats.match_names import match_files
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.errors import InputError
+from biresnerf.geometry.camera.camera_models import Camera
+from biresnerf.report import IntrinsicsSource
+from biresnerf.result import load
+
+
+def joined_to(dataset: Dataset, result: Path) -> tuple[Dataset, tuple[str, ...]]:
+    """The set with the result's poses and lenses for the photos that the result has; and the names of these.
+
+    Photos that share a camera with one of them see through its lens, if all of them see through one.
+
+    Raises:
+        InputError: ``result_missing``, ``no_common_images``, or a code of the readers.
+    """
+    earlier = load(result)
+    pose_of = dict(zip(earlier.names, earlier.poses, strict=True))
+    lens_of = dict(zip(earlier.names, earlier.intrinsics, strict=True))
+    found = {name: known for known, name in match_files(earlier.names, dataset.names)[0].items()}
+    if not found:
+        raise InputError(
+            "no_common_images",
+            f"has no photo of the result in {result}.",
+            where=dataset.root.name,
+            hint="Give the old photos under their old names, and the new ones beside them.",
+        )
+    cameras = list(dataset.cameras)
+    sources = [dataset.source_of_intrinsics(camera) for camera in range(len(cameras))]
+    numbers: dict[Camera, int] = {}
+    frames = []
+    for index, frame in enumerate(dataset.frames):
+        if frame.name in found:
+            known = found[frame.name]
+            number = numbers.setdefault(lens_of[known], len(cameras))
+            if number == len(cameras):
+                cameras.append(lens_of[known])
+                sources.append("given")
+            # A file's poses may be of pixels as they are stored, where a photo alone is turned upright.
+            shown = (dataset.camera_of(index).width, dataset.camera_of(index).height)
+            turned = frame.orientation if shown == (lens_of[known].width, lens_of[known].height) else 1
+            frame = replace(
+                frame, world_from_cam=pose_of[known], pose_source="given", camera=number, orientation=turned
+            )
+        frames.append(frame)
+    shared = _shared(dataset, [frame.camera for frame in frames])
+    joined = tuple(replace(frame, camera=shared.get(frame.camera, frame.camera)) for frame in frames)
+    return _with_used_cameras(replace(dataset, frames=joined), cameras, sources), tuple(found)
+
+
+def _shared(dataset: Dataset, now: list[int]) -> dict[int, int]:
+    """For each camera of the set, that of the result which all its known photos have, where that is one."""
+    known: dict[int, set[int]] = {}
+    for frame, camera in zip(dataset.frames, now, strict=True):
+        if camera != frame.camera:
+            known.setdefault(frame.camera, set()).add(camera)
+    return {camera: min(found) for camera, found in known.items() if len(found) == 1}
+
+
+def _with_used_cameras(dataset: Dataset, cameras: list[Camera], sources: list[IntrinsicsSource]) -> Dataset:
+    used = sorted({frame.camera for frame in dataset.frames})
+    return replace(
+        dataset,
+        cameras=tuple(cameras[index] for index in used),
+        intrinsics_sources=tuple(sources[index] for index in used),
+        frames=tuple(replace(frame, camera=used.index(frame.camera)) for frame in dataset.frames),
+    )
