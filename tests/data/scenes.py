@@ -16,7 +16,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from biresnerf.data.seeding import map_images
-from biresnerf.data.synthetic.scene import render_synthetic, synthetic_cameras
+from biresnerf.data.synthetic.camera_photos import Maker, stored_poses, write_camera_photo
+from biresnerf.data.synthetic.scene import render_synthetic, synthetic_cameras, synthetic_focal
 from biresnerf.errors import InputError
 
 WIDTH, HEIGHT = 20, 16
@@ -112,12 +113,21 @@ def arc_poses(views: int) -> np.ndarray:
     return poses
 
 
-def textured_arc(folder: Path, views: int, size: int) -> np.ndarray:
-    """Photos 00.png ... of the arc in `folder`, over grey so that no border is too sharp; returns its poses."""
+def textured_arc(folder: Path, views: int, size: int, maker: Maker | None = None) -> np.ndarray:
+    """Photos 00.png ... of the arc in `folder`, over grey so that no border is too sharp; returns its poses.
+
+    A maker's camera writes 00.jpg ..., and the poses are those of the pixels as it stores them.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     poses = arc_poses(views)
     for index, pose in enumerate(poses):
         picture = Image.fromarray(render_synthetic(pose, size, 4)[0])
         grey = Image.new("RGBA", picture.size, (128, 128, 128, 255))
-        Image.alpha_composite(grey, picture).convert("RGB").save(folder / f"{index:02}.png")
-    return poses
+        photo = Image.alpha_composite(grey, picture).convert("RGB")
+        path = folder / f"{index:02}.png"
+        if maker is None:
+            photo.save(path)
+        else:
+            shown = np.asarray(photo)
+            write_camera_photo(path.with_suffix(".jpg"), shown, maker, index, synthetic_focal(size), pose)
+    return stored_poses(poses, maker)

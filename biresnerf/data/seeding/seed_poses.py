@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from biresnerf.data.model.dataset import GUESSES, Dataset
 from biresnerf.data.photos.image_likeness import likeness
 from biresnerf.data.photos.named_images import MIN_IMAGES
+from biresnerf.data.photos.orientation import shown_from_cam
 from biresnerf.data.photos.photo_folders import few_names
 from biresnerf.data.photos.turning_object import turning_notes
 from biresnerf.data.seeding.cached_mapping import remembered_mapping
@@ -80,11 +81,16 @@ class _Given:
         """``matched`` where it placed an image, else the given pose, else a guess."""
         poses = self.poses.copy() if matched is None else matched.world_from_cam.copy()
         placed = np.zeros(len(poses), dtype=np.bool_) if matched is None else matched.placed
+        # Photos near each other may have been taken with the camera held level and on its side.
+        shown = shown_from_cam(self.dataset.frames)
+        upright = poses @ shown.swapaxes(1, 2)
         guessed = guess_missing(
-            poses, placed | self.posed, self.dataset.names, matches, cache(lambda: likeness(self.dataset))
+            upright, placed | self.posed, self.dataset.names, matches, cache(lambda: likeness(self.dataset))
         )
         sources: list[PoseSource] = ["given"] * len(poses)
         for i, guess in enumerate(guessed):
+            if guess is not None:
+                poses[i] = upright[i] @ shown[i]
             if guess is not None or placed[i]:
                 sources[i] = guess or source
         return InitialPoses(poses, name, tuple(sources))
@@ -176,7 +182,7 @@ def _without_features(given: _Given) -> InitialPoses:
         return given.without_matches()
     name: PoseSource = "forward-facing"
     count = len(given.dataset)
-    return InitialPoses(np.tile(np.eye(4), (count, 1, 1)), name, (name,) * count)
+    return InitialPoses(shown_from_cam(given.dataset.frames), name, (name,) * count)
 
 
 def _without_colmap(given: _Given, start: StartPoses) -> Seeding:

@@ -60,7 +60,9 @@ def find_start(
         monitor.report(Progress(stage="seeding", message=message))
         if first.source == "turntable":
             return start_on_turntable(first, images, options, device, threads, monitor.should_stop)
-        found = find_forward_facing(images, options, device, threads, monitor.should_stop)
+        found = find_forward_facing(
+            first.world_from_cam, images, options, device, threads, monitor.should_stop
+        )
         return replace(first, world_from_cam=found)
     if len(candidates) == 1:
         return replace(first, matched_poses=first.world_from_cam if first.matched.any() else None)

@@ -44,6 +44,7 @@ class Found:
 
 
 def find_forward_facing(
+    world_from_cam: NDArray[np.float64],
     images: ImageSet,
     options: ResolvedOptions,
     device: torch.device,
@@ -51,6 +52,9 @@ def find_forward_facing(
     should_stop: Callable[[], bool],
 ) -> NDArray[np.float64]:
     """Poses [n, 4, 4] of photos taken from nearly one place, in a frame of their own.
+
+    Args:
+        world_from_cam: where they begin [n, 4, 4]: at one place, turned as the cameras were held.
 
     Raises:
         InputError: ``insufficient_overlap``: no poses were found that predict unseen photos.
@@ -61,7 +65,7 @@ def find_forward_facing(
     def run(world_from_cam: NDArray[np.float64], steps: int) -> Found:
         return _short_run(images, frame, world_from_cam, options, steps, device, threads, should_stop)
 
-    first = run(np.tile(np.eye(4), (len(images), 1, 1)), FIRST_STEPS)
+    first = run(world_from_cam, FIRST_STEPS)
     tries = [run(rig, SECOND_STEPS) for rig in (first.world_from_cam, mirrored(first.world_from_cam))]
     logger.info("forward-facing: %.2f dB, mirrored in depth %.2f dB", tries[0].psnr, tries[1].psnr)
     best = max(tries, key=lambda found: found.psnr)

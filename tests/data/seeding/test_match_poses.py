@@ -17,6 +17,7 @@ from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.data.seeding.map_images import MappedModel
 from biresnerf.data.seeding.match_poses import carry_model
 from biresnerf.data.seeding.seed_poses import Seeding, seed_poses
+from biresnerf.data.synthetic.camera_photos import MAKERS
 from biresnerf.data.synthetic.scene import synthetic_focal
 from biresnerf.errors import FAULTS_RAISE, Interrupted, RefinementError
 from biresnerf.geometry.camera.camera_models import Camera
@@ -30,7 +31,7 @@ pytestmark = pytest.mark.slow
 
 pytest.importorskip("pycolmap", reason="needs pycolmap (pip install 'biresnerf[colmap]')")
 VIEWS, SIZE = 10, 200
-MISSING, BLANK = (2, 6), 5
+MISSING, BLANK = (2, 6), 4  # not a photo that its camera turns
 ORIENTATION = 0x0112
 
 
@@ -53,7 +54,7 @@ def quick():
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory) -> Dataset:
     folder = tmp_path_factory.mktemp("arc")
-    poses = textured_arc(folder, VIEWS, SIZE)
+    poses = textured_arc(folder, VIEWS, SIZE, MAKERS["android"])
     camera = Camera("SIMPLE_PINHOLE", SIZE, SIZE, (synthetic_focal(SIZE), SIZE / 2, SIZE / 2))
     frames = tuple(
         Frame(path.name, path, 0, pose, "given")
@@ -129,7 +130,7 @@ def test_what_matches_cannot_place_is_guessed_and_said(completed, truth):
         assert candidate.sources[BLANK] == "neighbours"
     best = completed.candidates[1]
     assert errors_deg(best.world_from_cam, truth.world_from_cam)[BLANK] < 8  # less than a step of the arc
-    assert any("05.png (neighbours)" in text for text in completed.dataset.warnings)
+    assert any("04.jpg (neighbours)" in text for text in completed.dataset.warnings)
 
 
 def model(truth: Dataset, *, turned: tuple[int, ...] = ()) -> MappedModel:
@@ -221,7 +222,7 @@ def test_names_with_spaces_are_matched_when_pairs_are_listed(monkeypatch, noisy,
     monkeypatch.setattr(map_images, "GUIDED_ALL_PAIRS_UP_TO", 3)
     frames = []
     for i, frame in enumerate(noisy.frames):
-        path = tmp_path / f"my photo {i:02}.png"
+        path = tmp_path / f"my photo {i:02}.jpg"
         path.write_bytes(frame.path.read_bytes())
         frames.append(replace(frame, path=path, name=path.name))
     _, matched, *_ = seed_poses(replace(noisy, root=tmp_path, frames=tuple(frames))).candidates

@@ -17,6 +17,7 @@ from biresnerf.data.formats.transforms.write_transforms import write_transforms
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.seeding import colmap_process
 from biresnerf.data.seeding.seed_poses import seed_poses
+from biresnerf.data.synthetic.camera_photos import MAKERS, stored_poses
 from biresnerf.data.synthetic.scene import synthetic_focal
 from biresnerf.errors import InputError, Interrupted, RefinementError
 from biresnerf.geometry.camera.camera_models import Camera
@@ -265,6 +266,13 @@ def test_without_features_missing_poses_come_from_neighbours_and_all_missing_one
     (candidate,) = seed_poses(without(truth, *range(VIEWS)), "none").candidates
     assert set(candidate.sources) == {"forward-facing"}
     np.testing.assert_array_equal(candidate.world_from_cam, np.tile(np.eye(4), (VIEWS, 1, 1)))
+
+
+def test_photos_of_a_camera_held_both_ways_begin_upright_side_by_side(tmp_path):
+    textured_arc(tmp_path, 4, 48, MAKERS["android"])
+    (candidate,) = seed_poses(read_dataset(tmp_path), "none").candidates
+    upright = np.tile(np.eye(4), (4, 1, 1))
+    np.testing.assert_array_equal(candidate.world_from_cam, stored_poses(upright, MAKERS["android"]))
 
 
 def test_without_colmap_given_poses_are_completed_and_the_user_is_told(folder, monkeypatch):
