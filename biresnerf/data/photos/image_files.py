@@ -7,7 +7,7 @@ import warnings
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -140,8 +140,17 @@ def images_called(folder: Path, name: str) -> list[Path]:
 def greyness(path: Path) -> int:
     """2 for a picture of one channel, as masks and depth maps are, 1 for one that shows no colours, else 0.
 
-    It may be decoded.
+    It may be decoded, once.
     """
+    try:
+        stat = path.stat()
+    except OSError:
+        return 0
+    return _greyness(path, stat.st_mtime_ns, stat.st_size)
+
+
+@lru_cache(maxsize=4096)
+def _greyness(path: Path, _mtime_ns: int, _size: int) -> int:
     try:
         with quiet_pillow(), open_image(path, path.name) as image:
             if image.mode in ("1", "L", "LA", "F") or image.mode.startswith("I"):

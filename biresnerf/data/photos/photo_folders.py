@@ -13,6 +13,7 @@ from pathlib import Path
 from biresnerf.data.model.image_order import natural_key
 from biresnerf.data.photos.image_files import greyness, is_image_name
 from biresnerf.data.photos.kinds.photo_kinds import INSTALL, KIND_OF, PHOTO_KINDS, is_readable
+from biresnerf.data.photos.named_images import lies_in
 from biresnerf.data.photos.video.ffmpeg_frames import DEMUXERS
 from biresnerf.errors import InputError
 
@@ -144,17 +145,25 @@ def _bare(name: str) -> str:
 
 
 def with_named(files: dict[str, Path], root: Path, names: Iterable[str]) -> dict[str, Path]:
-    """The photos of ``root`` or its images/, with those that poses name in place of what `doubled` prefers to them."""
-    wanted, files = list(names), dict(files)
-    asked = set(wanted)
+    """The photos of ``root`` or its images/, with those that poses name though they are called as maps of others are.
+
+    One that was preferred to it for its name is no photo then.
+    """
+    asked, limit, files = set(names), root.resolve(), dict(files)
+    key_of = {path: key for key, path in files.items()}
     twins = {(path.parent, path.stem.casefold()): key for key, path in files.items() if key not in asked}
     for name in asked - files.keys():
         for place in (root / IMAGE_FOLDER / name, root / name):
-            key = twins.get((place.parent, place.stem.casefold()))
-            if key in files and is_image_name(place) and place.is_file():
-                del files[key]
-                files[name] = place
-                break
+            if (
+                place in key_of
+                or not is_image_name(place)
+                or not lies_in(place, limit)
+                or not place.is_file()
+            ):
+                continue
+            files.pop(twins.get((place.parent, place.stem.casefold()), ""), None)
+            files[name] = place
+            break
     return files
 
 

@@ -89,6 +89,14 @@ def test_poses_that_name_the_grey_one_of_two_pictures_get_it(tmp_path, form):
     ]
 
 
+def test_poses_that_name_a_picture_called_as_a_map_get_it(tmp_path):
+    names = ("stand_1.png", "mask_1.png", "stand_2.png", "mask_2.png")
+    trajectories.colmap_set(tmp_path, names)
+    dataset = read_dataset(tmp_path)
+    assert {frame.path.name for frame in dataset.frames} == set(names)
+    assert dataset.posed.all()
+
+
 def test_a_name_without_extension_that_fits_two_files_is_said(tmp_path):
     document = nerfstudio_scene(tmp_path)
     for frame in document["frames"]:
