@@ -109,7 +109,7 @@ def parse_opensfm(_root: Path, file: Path) -> ParsedPoses:
 
     @cache
     def lens(key: str) -> Camera | LensOf | InputError:
-        return attempt(partial(_read_lens, cameras.get(key), f"{place}.cameras.{key}"))
+        return attempt(partial(read_lens, cameras.get(key), f"{place}.cameras.{key}"))
 
     def read(value: Any, where: str) -> Placed:
         shot = checked(_Shot, value, where, _HINT)
@@ -140,7 +140,8 @@ def world_from_cam_of_vector(rotation: _Vector, translation: _Vector, where: str
     return rigid_inverse(matrix_of_pose(rigid_pose((*quat_wxyz, *translation), where, _HINT)))
 
 
-def _read_lens(value: Any, where: str) -> Camera | LensOf:
+def read_lens(value: Any, where: str) -> Camera | LensOf:
+    """A camera's entry as a lens. Raises InputError ``camera_model_unsupported`` or another code for a wrong value."""
     lens = checked(_Lens, value, where, _HINT)
     kind = lens.projection_type
     if kind in ("spherical", "equirectangular"):
