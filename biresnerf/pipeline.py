@@ -14,7 +14,7 @@ from biresnerf.compile_kernels import compile_kernels
 from biresnerf.data.formats.positions.known_distance import KnownDistance
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.model.dataset import Dataset
-from biresnerf.data.model.part_of_set import without_photos
+from biresnerf.data.model.part_of_set import without_copies, without_photos
 from biresnerf.data.photos.images import load_images
 from biresnerf.data.photos.video.video_frames import VideoReading
 from biresnerf.data.points.tracks import Tracks
@@ -86,7 +86,7 @@ def refine_poses(
     )
 
     dataset = input if isinstance(input, Dataset) else _read(Path(input), setup)
-    dataset = without_photos(dataset, setup.options.leave_out)
+    dataset = without_copies(without_photos(dataset, setup.options.leave_out))
     scene, origin = _seed(dataset, setup)
     stages = _first_step(scene, origin, setup, observer)
     keep_to_budget(stages, started, setup.options.steps)

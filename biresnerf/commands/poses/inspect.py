@@ -39,7 +39,7 @@ def inspect_command(
 
     asked = parse_options({**settings, **({"preset": preset} if preset else {})})
     from biresnerf.data.formats.read_dataset import read_dataset
-    from biresnerf.data.model.part_of_set import without_photos
+    from biresnerf.data.model.part_of_set import without_copies, without_photos
     from biresnerf.data.photos.images import load_images
     from biresnerf.data.photos.turning_object import turning_notes
     from biresnerf.data.photos.video.video_frames import VideoReading
@@ -48,7 +48,7 @@ def inspect_command(
     options, _ = resolve_here(asked)
     dataset = read_dataset(input_path, videos=VideoReading(options.video_frames))
     missing_names = sorted(set(options.fixed) - {*dataset.names, *dataset.file_names})
-    dataset = without_photos(dataset, options.leave_out)
+    dataset = without_copies(without_photos(dataset, options.leave_out))
     if pixels:
         with tqdm(total=len(dataset), desc="decoding", unit="photo", leave=False, disable=None) as bar:
             load_images(dataset, options.max_image_size, options.background, lambda _done: bar.update())

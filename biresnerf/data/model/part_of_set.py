@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -10,6 +12,7 @@ from biresnerf.data.model.part_of_model import without_images
 from biresnerf.errors import InputError
 
 LEAST = 3  # photos that something can be made of
+MOST_NAMED = 10
 
 
 def without_photos(dataset: Dataset, names: Sequence[str]) -> Dataset:
@@ -52,3 +55,33 @@ def without_photos(dataset: Dataset, names: Sequence[str]) -> Dataset:
         source=replace(dataset.source, colmap=colmap),
         intrinsics_sources=tuple(sources[lens] for lens in lenses) if sources else (),
     )
+
+
+def without_copies(dataset: Dataset) -> Dataset:
+    """The set without photos whose files equal an earlier one's, and a note that names them.
+
+    A copy's matches with its original fit exactly, and say nothing of where anything is. Copies stay where without them
+    too few photos would be left.
+    """
+    size = [frame.path.stat().st_size for frame in dataset.frames]
+    several = Counter(size)
+    first: dict[bytes, str] = {}
+    copies: dict[str, str] = {}
+    for frame, bytes_ in zip(dataset.frames, size, strict=True):
+        if several[bytes_] > 1:
+            with frame.path.open("rb") as file:
+                original = first.setdefault(hashlib.file_digest(file, "sha256").digest(), frame.name)
+            if original != frame.name:
+                copies[frame.name] = original
+    if not copies or len(dataset) - len(copies) < LEAST:
+        return dataset
+    part = without_photos(dataset, tuple(copies))
+    named = [f"{copy} (of {original})" for copy, original in copies.items()]
+    listed = ", ".join(named[:MOST_NAMED]) + (
+        f" and {len(named) - MOST_NAMED} more" * (len(named) > MOST_NAMED)
+    )
+    note = (
+        f"{len(copies)} of {len(dataset)} photos are copies of others, and are left out, as they tell nothing new: "
+        f"{listed}. A copy's pose is its original's."
+    )
+    return replace(part, warnings=(*part.warnings, note))

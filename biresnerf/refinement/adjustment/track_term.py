@@ -27,6 +27,9 @@ ROBUST_SCALE = 3.0
 RAYLEIGH_MEDIAN = 1.1774  # of the length of two normal deviates
 FINEST_PX = 1e-3  # no feature is as exact: a lower noise level only makes the numbers worse
 SETTLING = 30
+APART = np.radians(
+    0.1
+)  # between two rays: with less, they tell nothing of their point, and fit it wherever it is
 
 
 class TrackTerm:
@@ -91,14 +94,31 @@ class TrackTerm:
         )
 
     def _measured_noise(self, cameras: Cameras) -> float:
-        """From the median residual; points and cameras have taken their share of the degrees of freedom."""
-        errors = self.errors_px(cameras)
+        """From the median residual; points and cameras have taken their share of the degrees of freedom.
+
+        Of points that are seen from places apart: copies of a photo, and photos from a tripod, fit each other exactly.
+        """
+        errors, apart = self.errors_px(cameras), self._seen_from_apart(cameras)
+        if apart.any():
+            errors = errors[apart[self.point]]
+        points, images = (
+            (int(apart.sum()), self.image[apart[self.point]]) if apart.any() else (len(apart), self.image)
+        )
         known = 2 * len(errors)
-        free = known - 3 * len(self.unknowns) - 6 * len(np.unique(self.image)) + 7
+        free = known - 3 * points - 6 * len(np.unique(images)) + 7
         if free <= 0:
             return self.noise_px
         noise = float(np.median(errors)) / RAYLEIGH_MEDIAN * (known / free) ** 0.5
         return max(noise, FINEST_PX) if np.isfinite(noise) else self.noise_px
+
+    def _seen_from_apart(self, cameras: Cameras) -> NDArray[np.bool_]:
+        """Points [p] whose viewing rays differ in direction."""
+        towards = self.unknowns[self.point] - cameras.centre[self.image]
+        towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-300)
+        count = len(self.unknowns)
+        total = np.stack([np.bincount(self.point, one, count) for one in towards.T], 1)
+        mean: Array = total / np.maximum(np.bincount(self.point, minlength=count), 1)[:, None]
+        return np.asarray(1 - (mean**2).sum(1) > np.sin(APART / 2) ** 2)
 
     def cost(self, cameras: Cameras, unknowns: Array) -> float:
         return float(track_cost(*self._seen(cameras, unknowns), self.noise_px, ROBUST_SCALE))

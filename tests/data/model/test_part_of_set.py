@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from biresnerf.data.formats.read_dataset import read_dataset
-from biresnerf.data.model.part_of_set import without_photos
+from biresnerf.data.model.part_of_set import without_copies, without_photos
 from biresnerf.errors import InputError
 from tests.data.formats.simple import trajectories
 
@@ -46,3 +48,31 @@ def test_a_name_of_no_photo_and_too_few_photos_are_refused(tmp_path: Path) -> No
         assert (caught.value.code, caught.value.where) == (code, "leave_out")
         assert caught.value.hint
     assert without_photos(whole, []) is whole
+
+
+def test_copies_of_a_photo_are_left_out_and_named(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for i in range(4):
+        Image.fromarray(rng.integers(0, 255, (24, 32, 3), np.uint8)).save(tmp_path / f"{i}.png")
+    for copy, original in (("1 (1)", "1"), ("z", "1"), ("z2", "3")):
+        shutil.copy(tmp_path / f"{original}.png", tmp_path / f"{copy}.png")
+    whole = read_dataset(tmp_path)
+    part = without_copies(whole)
+    first = {name: min(n for n in whole.names if same(tmp_path, n, name)) for name in whole.names}
+    assert set(part.names) == set(first.values())
+    (note,) = set(part.warnings) - set(whole.warnings)
+    assert note.startswith("3 of 7 photos are copies of others")
+    for copy in set(whole.names) - set(part.names):
+        assert copy in note
+    assert without_copies(part) is part
+
+
+def same(folder: Path, one: str, other: str) -> bool:
+    return (folder / one).read_bytes() == (folder / other).read_bytes()
+
+
+def test_copies_stay_where_too_few_photos_would_be_left(tmp_path: Path) -> None:
+    for i in range(5):
+        Image.new("RGB", (32, 24), (90, 90, 90 + i // 4)).save(tmp_path / f"{i}.png")
+    whole = read_dataset(tmp_path)
+    assert without_copies(whole) is whole

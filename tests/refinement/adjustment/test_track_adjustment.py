@@ -202,3 +202,19 @@ def test_degenerate_tracks_leave_finite_poses(rng, kind):
     if kind == "too few":
         np.testing.assert_array_equal(found.world_from_cam, truth)
         assert not found.used
+
+
+def test_photos_from_one_place_do_not_make_the_others_features_look_exact(rng):
+    """As frames of a video that hardly differ: most observations lie in points that only these see."""
+    truth, evidence = scene(rng, cameras=9, noise_px=0.4)
+    start = disturbed(truth, rng, 0.005, 0.02)
+    copied = observed(truth[:1], rng.uniform(-0.8, 0.8, (700, 3)), pinholes(1), rng, seen_by=1).xy
+    point = np.concatenate([evidence.tracks.point, evidence.tracks.points + np.repeat(np.arange(700), 3)])
+    image = np.concatenate([evidence.tracks.image, np.tile([0, 9, 10], 700)])
+    tracks = Tracks(point, image, np.concatenate([evidence.tracks.xy, copied.repeat(3, axis=0)]))
+    poses = np.concatenate([start, start[[0, 0]]])
+    found = adjust_poses(poses, Evidence(pinholes(11), tracks), loose(poses))
+    assert found.track_noise_px == pytest.approx(0.4, rel=0.15)
+    alone = adjust_poses(start, evidence, loose(start))
+    error, without = (rotation_errors_deg(each.world_from_cam[:9], truth).mean() for each in (found, alone))
+    assert error < 1.2 * without
