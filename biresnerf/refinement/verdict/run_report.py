@@ -21,6 +21,7 @@ from biresnerf.refinement.optimise.step_graphs import slower_steps
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.two_stages import TwoStages
 from biresnerf.refinement.start.choose_start import MARGIN_DB
+from biresnerf.refinement.start.matches_explained import explained_from_one_place
 from biresnerf.refinement.start.refined_poses import RefinedPoses
 from biresnerf.refinement.verdict.camera_reports import camera_reports, focal_warnings
 from biresnerf.refinement.verdict.judgement import Judgement, motion
@@ -30,6 +31,8 @@ from biresnerf.refinement.views.evaluation import ViewScore
 from biresnerf.refinement.views.floaters import unshared_opacity
 from biresnerf.report import HeldOut, ImageReport, Report
 from biresnerf.uncertainty import PoseUncertainty
+
+ONE_PLACE = 0.9  # of the matches, within 0.3 % of the photo's long side
 
 
 def run_report(
@@ -83,6 +86,7 @@ def run_report(
         + turntable_warnings(scene.start)
         + accuracy_warnings(finish.given, optimiser.options)
         + unmatched_warnings(scene)
+        + one_place_warnings(scene, refined.world_from_cam)
         + gpu_warnings(optimiser.device)
         + smaller_batches(optimiser)
         + slower_steps(optimiser)
@@ -137,6 +141,20 @@ def unmatched_warnings(scene: Scene) -> tuple[str, ...]:
     return (
         f"{len(unmatched)} of {count} images have no feature matches; their poses come from the photos alone. Check "
         f"them before you rely on them: {names}.",
+    )
+
+
+def one_place_warnings(scene: Scene, refined: np.ndarray) -> tuple[str, ...]:
+    """A warning where rotations alone explain the feature matches."""
+    if scene.tracks is None or not np.isfinite(refined).all():
+        return ()
+    share = explained_from_one_place(scene.dataset, scene.tracks, refined)
+    if share < ONE_PLACE:
+        return ()
+    return (
+        f"The photos seem to have been taken from one place, as from a tripod: rotations alone explain {share:.0%} of "
+        "the feature matches. Refined rotations can be relied on; positions and scale mean nothing. Move between "
+        "photos.",
     )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
+from biresnerf.data.points.tracks import Tracks
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.errors import Interrupted
 from biresnerf.geometry.perturb import perturb_poses
@@ -16,7 +17,7 @@ from biresnerf.progress import Monitor
 from biresnerf.refinement.start import choose_start as start_module
 from biresnerf.refinement.start.choose_start import choose_start, find_start
 from biresnerf.refinement.start.first_step import pose_mobility, stage_lengths
-from biresnerf.refinement.start.matches_explained import matches_explained
+from biresnerf.refinement.start.matches_explained import explained_from_one_place, matches_explained
 from biresnerf.refinement.views import pose_trials
 from biresnerf.refinement.views.pose_trials import PoseTrials, trial_views
 from tests.refinement.tiny_scene import CPU, tiny_options, tiny_set, true_matches
@@ -187,6 +188,24 @@ def test_stage_1_is_shorter_where_matches_placed_the_cameras_and_its_length_was_
     assert (shorter.coarse_steps_min, shorter.coarse_steps_max) == (400, 800)
     fixed = RefineOptions(preset="fast", coarse_steps_min=500, coarse_steps_max=900)
     assert stage_lengths(matched, fixed, fixed.resolved("cpu")) == fixed.resolved("cpu")
+
+
+def test_photos_from_one_place_are_told_from_others_by_their_matches(scene):
+    dataset, _ = scene
+    truth, tracks = dataset.world_from_cam, true_matches(dataset, noise_px=0.1)
+    assert explained_from_one_place(dataset, tracks, truth) < 0.1
+    rng, panned = np.random.default_rng(1), truth.copy()
+    panned[:, :3, 3] = 0.0
+    points, pair = rng.normal(size=(900, 3)) * 9, rng.integers(0, VIEWS, (900, 2))
+    lens = dataset.camera_of(0).full()
+    in_cam = np.einsum("msji,mj->msi", panned[pair][:, :, :3, :3], points)
+    seen = (in_cam[..., 2] > 1).all(1) & (pair[:, 0] != pair[:, 1])
+    xy = in_cam[..., :2] / in_cam[..., 2:] * [lens.fx, lens.fy] + [lens.cx, lens.cy]
+    matches = Tracks.of_matches(pair[seen], xy[seen])
+    assert matches is not None
+    assert explained_from_one_place(dataset, matches, panned) > 0.99
+    turned = perturb_poses(panned, 0.05, seed=1)
+    assert explained_from_one_place(dataset, matches, turned) < 0.5
 
 
 @pytest.mark.parametrize("asked", [{}, {"coarse_steps_min": 10}, {"coarse_steps_max": 20}])
