@@ -11,6 +11,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatch
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -92,8 +93,15 @@ def pose_like_notes(root: Path, names: Sequence[str], known: Sequence[Path] = ()
     """A note on files that may hold poses of the photos ``names``, but ``known`` ones."""
     stems = {_stem(name) for name in names}
     found: list[str] = []
+    notes: list[str] = []
     for folder, _, files in folders_of_set(root):
         others = [folder / name for name in files if not is_photo_name(name) and folder / name not in known]
+        notes += [
+            f"{path.relative_to(root).as_posix()} holds camera poses of {form.program}, which are not read"
+            for form in UNREAD
+            for path in others
+            if any(fnmatch(path.name, name) for name in form.names) and _begins(path, form.begins)
+        ]
         own = [path for path in others if _stem(path.name) in stems and not _NO_POSES.search(path.name)]
         if len(own) >= max(3, len(stems) / 2):
             if _one_pose_each(own):
@@ -104,10 +112,11 @@ def pose_like_notes(root: Path, names: Sequence[str], known: Sequence[Path] = ()
         tables = [path for path in others if _TABLES.search(path.name)][:_MOST_FILES]
         found += [path.relative_to(root).as_posix() for path in tables if _like_poses(path, names)]
     if not found:
-        return []
+        return notes
     return [
+        *notes,
         f"{few_names(found, 3)} may hold poses, by what numbers they hold, and were not read: "
-        "give poses in one of the forms of docs/formats.md"
+        "give poses in one of the forms of docs/formats.md",
     ]
 
 

@@ -41,6 +41,15 @@ def test_the_form_is_named(photos, name):
     assert (caught.value.code, caught.value.where) == ("poses_not_read", name)
 
 
+@pytest.mark.parametrize("name", FILES)
+def test_in_a_folder_below_the_form_is_named_and_the_photos_are_read(photos, name):
+    (photos / "old").mkdir()
+    (photos / "old" / name).write_text(FILES[name])
+    dataset = read_dataset(photos)
+    assert len(dataset) == 4
+    assert any(f"old/{name} holds camera poses of" in text for text in dataset.warnings)
+
+
 def test_every_form_is_tried():
     assert len(UNREAD) == len(FILES)
 

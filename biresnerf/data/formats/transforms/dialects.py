@@ -110,11 +110,24 @@ def _has_focal(place: dict[str, Any]) -> bool:
 
 
 def _put_matrix_into_keys(place: dict[str, Any], where: str) -> None:
-    """Replaces an intrinsic matrix of a frame, or of the file, by keys, unless a focal length is given."""
+    """Replaces an intrinsic matrix of a frame, or of the file, by keys, unless a focal length is given.
+
+    So does it with the four numbers fx, fy, cx, cy: in a list, or under these names.
+    """
+    for short, key in (("fx", "fl_x"), ("fy", "fl_y")) if not _has_focal(place) else ():
+        if place.get(short) is not None:
+            place[key] = place.pop(short)
     for key in _LENSES if not _has_focal(place) else ():
         with suppress(TypeError, ValueError):
-            matrix = np.array(place.get(key), dtype=np.float64)
+            value = place.get(key)
+            value = (
+                [value.get(name) for name in ("fx", "fy", "cx", "cy")] if isinstance(value, dict) else value
+            )
+            matrix = np.array(value, dtype=np.float64)
             matrix = matrix.reshape(3, 3) if matrix.shape == (9,) else matrix
+            if matrix.shape == (4,):
+                fx, fy, cx, cy = matrix
+                matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
             if matrix.shape not in ((3, 3), (3, 4), (4, 4)) or not np.isfinite(matrix).all():
                 continue
             fx, skew, cx, fy, cy = (float(matrix[at]) for at in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)))

@@ -50,7 +50,15 @@ def test_cameras_of_other_axes_are_read_and_written_with_opengls(tmp_path, key):
 
 
 @pytest.mark.parametrize(
-    "lens", [K, np.pad(K, ((0, 1), (0, 1))).tolist(), np.ravel(K).tolist()], ids=["3 x 3", "4 x 4", "flat"]
+    "lens",
+    [
+        K,
+        np.pad(K, ((0, 1), (0, 1))).tolist(),
+        np.ravel(K).tolist(),
+        list(LENS),
+        dict(zip(("fx", "fy", "cx", "cy"), LENS, strict=True)),
+    ],
+    ids=["3 x 3", "4 x 4", "flat", "four numbers", "four names"],
 )
 @pytest.mark.parametrize("key", ["intrinsic_matrix", "K", "intrinsics"])
 def test_a_matrix_at_the_top_is_the_lens_unless_a_focal_length_is_given(tmp_path, key, lens):
@@ -60,6 +68,12 @@ def test_a_matrix_at_the_top_is_the_lens_unless_a_focal_length_is_given(tmp_path
     assert read_dataset(tmp_path).cameras[0].params == LENS
     save(tmp_path, document | given | {"fl_x": 17.0, key: lens})
     assert read_dataset(tmp_path).cameras[0].params == (17.0, *LENS[1:])
+
+
+def test_fx_and_fy_are_focal_lengths_where_no_other_is_given(tmp_path):
+    document = nerfstudio_scene(tmp_path)
+    document |= {"fx": document.pop("fl_x"), "fy": document.pop("fl_y")}
+    assert read_dataset(save(tmp_path, document)).cameras[0].params == LENS
 
 
 def test_the_first_of_two_poses_of_a_rolling_shutter_is_the_frames(tmp_path):
