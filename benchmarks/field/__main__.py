@@ -12,7 +12,7 @@ import json
 import os
 from pathlib import Path
 
-from benchmarks.field.run_set import Asked, run_set
+from benchmarks.field.run_set import RUNS, Asked, run_set
 from benchmarks.field.sets import read_sets
 from benchmarks.field.table import table
 
@@ -24,6 +24,7 @@ def main() -> None:
     parser.add_argument("--photos", type=int, help="Of a set, at most: its first ones.")
     parser.add_argument("--preset", default="fast")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--runs", default=",".join(RUNS), help="Which, with commas. Default: %(default)s.")
     parser.add_argument("--url", help="A service that gets each set as well.")
     parser.add_argument(
         "--keep", action="store_true", help="Do not repeat runs of the product that are done."
@@ -38,9 +39,8 @@ def main() -> None:
     rows = Path(data) / "rows"
     rows.mkdir(parents=True, exist_ok=True)
     settings = [part for setting in options.set for part in ("--set", setting)]
-    asked = Asked(
-        Path(data), options.photos, ("--preset", options.preset, *settings), options.url, options.keep
-    )
+    product, runs = ("--preset", options.preset, *settings), tuple(options.runs.split(","))
+    asked = Asked(Path(data), options.photos, product, options.url, runs, options.keep)
     chosen = [each for each in listed if each.name in options.sets] if options.sets else [
         each for each in listed if each.held_back == options.held_back
     ]  # fmt: skip

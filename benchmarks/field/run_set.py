@@ -21,6 +21,7 @@ from biresnerf.data.formats.read_dataset import read_poses
 from biresnerf.geometry.pose_error import pose_error
 
 Row = dict[str, Any]
+RUNS = ("alone", "noisy", "owner")  # photos alone, with noisy poses, with what the owner published
 NICE = ("nice", "-n", "10")
 
 
@@ -33,6 +34,7 @@ class Asked:
         photos: of a set, at most.
         options: of the product, as on its command line.
         url: of a service that gets the set as well.
+        runs: of `RUNS`, those that are made.
         keep: takes the product's results that are there, in place of new ones.
     """
 
@@ -40,6 +42,7 @@ class Asked:
     photos: int | None
     options: tuple[str, ...]
     url: str | None
+    runs: tuple[str, ...]
     keep: bool
 
 
@@ -74,7 +77,8 @@ def run_set(field_set: FieldSet, asked: Asked) -> Row:
     if field_set.owner_poses:
         given["owner"] = source
     for name, folder in given.items():
-        row[name] = _refined(folder, work / f"{name}-out", asked, judge, None)
+        if name in asked.runs:
+            row[name] = _refined(folder, work / f"{name}-out", asked, judge, None)
     if asked.url is not None:
         row["http"] = _refined(given.get("noisy", given["alone"]), work / "http-out", asked, judge, asked.url)
     return row
