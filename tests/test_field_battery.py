@@ -132,6 +132,8 @@ def test_the_table_has_what_failed_too():
         "alone": {"error": "first\nlast line", "seconds": 5},
         "noisy": run | {"deg": 0.084, "own_frame_deg": 0.1},
     }  # fmt: skip
+    counted = table([row | {"alone": run | {"known": 7}}]).splitlines()[-1]
+    assert "| 7 of 8 known; 0.41 px; 2.3 m; kept input |" in counted
     assert table([row]).splitlines()[-1] == (
         "| x: a tree | 8 of 40 x 30 | 8 of 8; 0.41 px; 2.3 m; kept input | failed: last line "
         "| 13.0° -> 0.08°, own frame 0.10°; 0.41 px; 2.3 m; kept input | 5, 9 | -, 1 |"

@@ -33,12 +33,13 @@ def _line(row: Row) -> tuple[str, ...]:
 
 
 def _placed(run: Row | None, count: int) -> str:
-    """Photos placed, then how well matches and GPS fit, then the verdict."""
+    """Photos placed, by the product those whose accuracy it states; how well matches and GPS fit; the verdict."""
     if run is None:
         return "-"
     if "error" in run:
         return f"failed: {run['error'].splitlines()[-1][:80]}"
-    return "; ".join([f"{run['placed']} of {count}", *_figures(run)])
+    placed = f"{run['known']} of {count} known" if "known" in run else f"{run['placed']} of {count}"
+    return "; ".join([placed, *_figures(run)])
 
 
 def _noisy(row: Row) -> str:
