@@ -15,7 +15,7 @@ STEP_SHARE = 0.5
 LEAST_POSED = 4
 # Of two orders of names, the one along which the cameras' path is this much shorter is meant. Shuffled poses of six
 # sets (11 to 50 photos) rarely come below it, twice in ten thousand tries; ordered ones mostly lie at 0.4 to 0.7.
-SHORTER = 0.75
+SHORTER, LEAST_ORDERED = 0.75, 10  # of fewer photos chance shortens paths as much
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
@@ -43,7 +43,7 @@ def names_of_poses(
         return by_number, ""
     row_of = {name: row for row, name in enumerate(by_text)}
     lengths = (_path_length(poses), _path_length([poses[row_of[name]] for name in by_number]))
-    decided = min(lengths) < SHORTER * max(lengths)
+    decided = len(names) >= LEAST_ORDERED and min(lengths) < SHORTER * max(lengths)
     as_text = lengths[1] < lengths[0] if decided else as_text
     first, second = next((a, b) for a, b in zip(by_number, by_text, strict=True) if a != b)
     before, after = (second, first) if as_text else (first, second)
