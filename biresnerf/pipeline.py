@@ -13,6 +13,8 @@ import torch
 from biresnerf.compile_kernels import compile_kernels
 from biresnerf.data.formats.positions.known_distance import KnownDistance
 from biresnerf.data.formats.read_dataset import read_dataset
+from biresnerf.data.given_poses.likely_reading import as_warning, pose_question
+from biresnerf.data.given_poses.readings import read_as
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.part_of_set import without_copies, without_photos
 from biresnerf.data.photos.images import load_images
@@ -87,6 +89,7 @@ def refine_poses(
 
     dataset = input if isinstance(input, Dataset) else _read(Path(input), setup)
     dataset = without_copies(without_photos(dataset, setup.options.leave_out))
+    dataset = _as_meant(dataset, setup.options)
     scene, origin = _seed(dataset, setup)
     stages = _first_step(scene, origin, setup, observer)
     keep_to_budget(stages, started, setup.options.steps)
@@ -163,6 +166,15 @@ def _read(path: Path, setup: _Setup) -> Dataset:
     watch = told_before_the_run(setup.monitor.report, setup.monitor.should_stop)
     videos = VideoReading(setup.options.video_frames, watch)
     return read_dataset(path, strict=setup.options.bad_frames == "refuse", videos=videos)
+
+
+def _as_meant(dataset: Dataset, options: ResolvedOptions) -> Dataset:
+    """The set with given poses read as the user says, or a warning that they seem to be meant in another way."""
+    dataset = read_as(dataset, options.given_poses)
+    question = None if options.given_poses else pose_question(dataset)
+    if question is None:
+        return dataset
+    return replace(dataset, warnings=(*dataset.warnings, as_warning(question)))
 
 
 def _seed(dataset: Dataset, setup: _Setup) -> tuple[Scene, RunOrigin]:

@@ -41,6 +41,8 @@ class Format:
         in_set: where `convert` writes it in its folder; empty for formats that it does not write.
         in_result: where it lies in the folder of a result; the same place where left out.
         always: every result has it.
+        axes, cam_from_world, quaternion: how it has poses, for questions whether a file means what the format says: the
+            camera's axes, whether world to camera, and the order of its quaternions.
         needs: ``photos``: the input's photos; ``images folder``: all of them directly in images/; ``lens file``: a
             camera.json beside it, as it has no lenses; ``bounds``: depths of the nearest and farthest point; ``input``:
             the input's own file.
@@ -61,6 +63,9 @@ class Format:
     suffixes: tuple[str, ...] = ()
     gives: str = ""
     checked_against: str = ""
+    axes: Literal["opencv", "opengl"] = "opencv"
+    cam_from_world: bool = False
+    quaternion: Literal["", "wxyz", "xyzw"] = ""
     in_set: str = ""
     in_result: str = ""
     always: bool = False

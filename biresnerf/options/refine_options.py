@@ -9,9 +9,18 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Generic, Literal, Never, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from biresnerf.options.formats import ExportName
+from biresnerf.options.given_poses import PoseReading, refuse_contradictions
 from biresnerf.options.option import ONCE, Option, all_required, divided, lowered
 from biresnerf.options.presets import (
     FEWEST_OF_STAGE,
@@ -32,6 +41,7 @@ StartPoses = Literal["auto", "given", "colmap", "none", "turntable"]
 RefineIntrinsics = Literal["auto", "none", "focal", "all"]
 SeedingEffort = Literal["full", "low"]
 Names = Annotated[tuple[str, ...], *ONCE]
+Readings = Annotated[tuple[PoseReading, ...], *ONCE, AfterValidator(refuse_contradictions)]
 Exports = Annotated[tuple[ExportName, ...], *ONCE]
 HeldOut = Annotated[int, Field(ge=0, le=200)] | Literal["auto"]
 
@@ -95,6 +105,14 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
     ] = Field(
         "full",
         description="low: fewer features from smaller photos in one thread: takes less memory, places fewer photos.",
+    )
+    given_poses: Annotated[Readings, Option("seeding", "What given poses are", level="usual")] = Field(
+        (),
+        max_length=10,
+        description="Where given poses are not what their format says. inverted: world to camera where camera to world "
+        "is meant, or the reverse; transposed: rotations by columns for rows; opencv_axes, opengl_axes: of the "
+        "cameras; wxyz, xyzw: order of quaternions; left_handed: as in Unity; rolled_90, rolled_180, rolled_270: "
+        "photos were turned clockwise since.",
     )
     bad_frames: Annotated[Literal["leave_out", "refuse"], Option("seeding", "Bad frames")] = Field(
         "leave_out", description="Frames whose photo, pose or lens is missing or broken, where most are good."

@@ -8,6 +8,7 @@ from urllib.parse import quote
 
 from pydantic import ConfigDict, Field, StringConstraints
 
+from biresnerf.options.given_poses import PoseQuestion
 from biresnerf.options.presets import PresetName
 from biresnerf.report import IntrinsicsSource
 from biresnerf.wire.base import NO_CONTROLS, Links, Page, Record
@@ -43,6 +44,11 @@ class CheckReport(Record):
     masks: int = Field(examples=[0])
     transparency: bool = Field(description="Whether images have an alpha channel.")
     warnings: tuple[str, ...] = Field(examples=[[]])
+    pose_question: PoseQuestion | None = Field(
+        None,
+        examples=[None],
+        description="Whether the given poses are meant in another way; null: it seems not.",
+    )
     expected_s: dict[PresetName, float] = Field(
         {},
         examples=[{"fast": 95.0, "balanced": 340.0}],
@@ -117,6 +123,11 @@ class CheckedPhoto(Record):
     world_from_cam: tuple[Row, Row, Row] | None = Field(
         examples=[[[1, 0, 0, 0.2], [0, 1, 0, 0], [0, 0, 1, -3.1]]],
         description="The given pose: the upper three rows, OpenCV axes, in the input's world. Null: to be found.",
+    )
+    read_as_asked: tuple[Row, Row, Row] | None = Field(
+        None,
+        examples=[None],
+        description="The given pose if the answer to the report's `pose_question` is yes.",
     )
     masked: bool = Field(examples=[False])
     path: str | None = Field(

@@ -7,12 +7,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import httpx
+import numpy as np
 import pytest
 from PIL import Image
 from playwright.sync_api import Page, expect
 
 from biresnerf.viewer.report_html import read_report
 from service.web_page import EXAMPLE
+from tests.data.given_poses.views import around, written
 from tests.service.conftest import LIMITS, Running
 from tests.web.conftest import check_row, drop, zip_of
 from tests.web.watched import Watched
@@ -129,6 +131,33 @@ def test_a_checked_set_shows_its_photos_and_cameras_and_leaves_photos_out(
     job = sent.value.json()
     chosen = {"leave_out": ["./train/r_3"], "known_distance": distance}
     assert job["options"] == {"preset": "balanced", **chosen}
+    api.post(f"/jobs/{job['id']}/cancel")
+    assert tab.complaints == []
+
+
+def test_poses_that_seem_to_mean_something_else_are_converted_with_a_click(
+    tab: Watched, service: Running, tmp_path: Path, api: httpx.Client
+) -> None:
+    page = tab.page
+    written(tmp_path / "cv", around() @ np.diag([1.0, -1, -1, 1]), around())
+    page.goto(service.url)
+    drop(page, tmp_path / "cv")
+    question = page.get_by_role("region", name="Convert the poses?")
+    expect(question).to_contain_text("seem to have OpenCV's axes")
+    expect(question).to_contain_text("They are used as they are.")
+    stage = page.get_by_role("application")
+    page.get_by_role("checkbox", name="Photos", exact=True).uncheck()
+    given = stage.screenshot()
+    question.get_by_role("button", name="Convert").click()
+    expect(question.get_by_role("button")).to_have_attribute("aria-pressed", "true")
+    while stage.screenshot() == given:  # until the cameras stand otherwise
+        page.wait_for_timeout(100)
+    tab.screenshot("pose-question")
+    assert tab.findings_in_each_look() == []
+    with page.expect_response(lambda sent: sent.url.endswith("/v1/jobs")) as sent:
+        page.get_by_role("button", name="Refine the poses").click()
+    job = sent.value.json()
+    assert job["options"] == {"preset": "balanced", "given_poses": ["opencv_axes"]}
     api.post(f"/jobs/{job['id']}/cancel")
     assert tab.complaints == []
 

@@ -53,6 +53,8 @@ def check(folder: Path, shown: Path) -> dict[str, Any]:
         InputError: what is wrong, with which file, and a hint.
     """
     from biresnerf.data.formats.read_dataset import read_dataset
+    from biresnerf.data.given_poses.likely_reading import pose_question
+    from biresnerf.data.model.part_of_set import without_copies
     from biresnerf.data.photos.images import load_images
     from biresnerf.data.photos.turning_object import turning_notes
     from workers.datasets.shown_set import expected_seconds, small_side, write_shown
@@ -60,7 +62,8 @@ def check(folder: Path, shown: Path) -> dict[str, Any]:
     sent = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
     dataset = read_dataset(folder, within=folder)
     images = load_images(dataset, small_side(len(dataset)))
-    write_shown(dataset, images, folder, sent, shown)
+    question = pose_question(dataset)
+    write_shown(dataset, images, folder, sent, shown, question.given_poses if question else ())
     posed = int(dataset.posed.sum())
     return {
         "images": len(dataset),
@@ -73,7 +76,8 @@ def check(folder: Path, shown: Path) -> dict[str, Any]:
         "format": dataset.source.dialect,
         "masks": sum(frame.mask is not None for frame in dataset.frames),
         "transparency": images.alpha is not None,
-        "warnings": [*dataset.warnings, *turning_notes(dataset)],
+        "warnings": [*without_copies(dataset).warnings, *turning_notes(dataset)],
+        "pose_question": question and question.model_dump(mode="json"),
         "expected_s": expected_seconds(dataset, unbounded=images.background is None),
     }
 

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from biresnerf.cores import usable_cores
+from biresnerf.data.given_poses.readings import read_as
 from biresnerf.data.model.dataset import Dataset, Frame
 from biresnerf.data.photos.images import ImageSet, load_images
 from biresnerf.data.photos.masks import mask_place
 from biresnerf.data.show.view_pictures import CELL_PX, THUMBNAIL_PX, write_contact_sheet, write_thumbnail
 from biresnerf.data.workload import can_be_adjusted, workload
 from biresnerf.forecast import latest_machine, remembered_rates
+from biresnerf.options.given_poses import PoseReading
 from biresnerf.options.presets import PRESETS, ComputeDevice, PresetName
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.wire.datasets import CheckedCamera, CheckedPhoto, MaskPlace, PhotoList, PhotoSheet
@@ -28,18 +31,28 @@ def small_side(count: int) -> int:
 
 
 def write_shown(
-    dataset: Dataset, images: ImageSet, checked: Path, sent: Collection[str], folder: Path
+    dataset: Dataset,
+    images: ImageSet,
+    checked: Path,
+    sent: Collection[str],
+    folder: Path,
+    asked: Sequence[PoseReading],
 ) -> None:
     """The list of photos with their poses, all photos in one picture, and the first one, into ``folder``.
 
-    ``sent``: the paths of the set's own files in the folder ``checked``, which by now has frames of videos as well.
+    Args:
+        sent: the paths of the set's own files in the folder ``checked``, which by now has frames of videos as well.
+        asked: the reading of given poses that the user is asked about; empty for none.
     """
     folder.mkdir(parents=True, exist_ok=True)
     sheet = write_contact_sheet(images, folder)
     first = load_images(replace(dataset, frames=dataset.frames[:1]), THUMBNAIL_PX)
     write_thumbnail(first.image(0), folder / FIRST_PHOTO)
     photos = PhotoList(
-        photos=tuple(_listed(frame, checked, sent) for frame in dataset.frames),
+        photos=tuple(
+            _listed(frame, checked, sent, _rows(other) if asked else None)
+            for frame, other in zip(dataset.frames, read_as(dataset, asked).frames, strict=True)
+        ),
         cameras=tuple(
             CheckedCamera(model=one.model, width=one.width, height=one.height, params=tuple(one.params))
             for one in dataset.cameras
@@ -49,13 +62,18 @@ def write_shown(
     (folder / PHOTO_LIST).write_text(photos.model_dump_json(), "utf-8")
 
 
-def _listed(frame: Frame, checked: Path, sent: Collection[str]) -> CheckedPhoto:
+def _rows(frame: Frame) -> Any:
+    return None if frame.world_from_cam is None else frame.world_from_cam[:3].tolist()
+
+
+def _listed(frame: Frame, checked: Path, sent: Collection[str], as_asked: Any) -> CheckedPhoto:
     path, (mask, inverted) = _inside(frame.path, checked), mask_place(frame)
     own = path in sent
     return CheckedPhoto(
         name=frame.name,
         camera=frame.camera,
-        world_from_cam=None if frame.world_from_cam is None else frame.world_from_cam[:3].tolist(),
+        world_from_cam=_rows(frame),
+        read_as_asked=as_asked,
         masked=frame.mask is not None,
         path=path if own else None,
         orientation=frame.orientation,

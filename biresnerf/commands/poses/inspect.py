@@ -39,6 +39,7 @@ def inspect_command(
 
     asked = parse_options({**settings, **({"preset": preset} if preset else {})})
     from biresnerf.data.formats.read_dataset import read_dataset
+    from biresnerf.data.given_poses.readings import read_as
     from biresnerf.data.model.part_of_set import without_copies, without_photos
     from biresnerf.data.photos.images import load_images
     from biresnerf.data.photos.turning_object import turning_notes
@@ -49,11 +50,13 @@ def inspect_command(
     dataset = read_dataset(input_path, videos=VideoReading(options.video_frames))
     missing_names = sorted(set(options.fixed) - {*dataset.names, *dataset.file_names})
     dataset = without_copies(without_photos(dataset, options.leave_out))
+    dataset = read_as(dataset, options.given_poses)
     if pixels:
         with tqdm(total=len(dataset), desc="decoding", unit="photo", leave=False, disable=None) as bar:
             load_images(dataset, options.max_image_size, options.background, lambda _done: bar.update())
     wanted = {**plan(dataset, options), "seconds": expected_seconds(dataset, asked)}
     found = {**contents(dataset), "pixels_checked": pixels, "plan": wanted}
+    found["pose_question"] = None if options.given_poses else question_about(dataset)
     found["warnings"] += turning_notes(dataset)
     found["warnings"] += [f"fixed names no image: {name}" for name in missing_names]
     show(found, "\n".join(_lines(found)), as_json=as_json)
@@ -83,6 +86,17 @@ def contents(dataset: Dataset) -> dict[str, Any]:
         ],
         "warnings": list(dataset.warnings),
     }
+
+
+def question_about(dataset: Dataset) -> dict[str, Any] | None:
+    """What to ask about the given poses, as JSON values; nothing where a photo cannot be decoded: see --pixels."""
+    from biresnerf.data.given_poses.likely_reading import pose_question
+
+    try:
+        question = pose_question(dataset)
+    except InputError:
+        return None
+    return question.model_dump(mode="json") if question else None
 
 
 def plan(dataset: Dataset, options: ResolvedOptions) -> dict[str, Any]:
@@ -191,4 +205,10 @@ def _lines(found: dict[str, Any]) -> list[str]:
     if wanted["seconds"]:
         times = (f"{in_minutes(s)} ({preset})" for preset, s in wanted["seconds"].items())
         lines.append("  take about " + ", ".join(times))
-    return lines + [f"warning: {warning}" for warning in found["warnings"]]
+    lines += [f"warning: {warning}" for warning in found["warnings"]]
+    if asked := found["pose_question"]:
+        lines += [
+            f"question: {asked['question']}",
+            f"  If so: --set given_poses={','.join(asked['given_poses'])}",
+        ]
+    return lines

@@ -2,8 +2,8 @@
 import titles from "../option_titles.json"; // written by `make docs` from the declaration of the options
 
 const TITLES: Readonly<Record<string, string>> = titles;
-const NAME = /\b([a-z]+(?:_[a-z0-9]+)+)(?:=(\w+))?/g;
-const CHOICE = /^[a-z]+(_[a-z]+)+$/;
+const NAME = /\b([a-z]+(?:_[a-z0-9]+)+)(?:=(\w+(?:,\w+)*))?/g;
+const CHOICE = /^[a-z]+(_[a-z0-9]+)+$/;
 
 export const optionTitle = (name: string): string => TITLES[name] ?? name;
 
@@ -20,6 +20,6 @@ export function worded(text: string): string {
   return text.replace(NAME, (found, name: string, value?: string) => {
     const title = TITLES[name];
     if (title === undefined) return found;
-    return value ? `“${title}: ${value}”` : `“${title}”`;
+    return value ? `“${title}: ${value.split(",").map(optionText).join(", ")}”` : `“${title}”`;
   });
 }

@@ -13,6 +13,7 @@ import { ProblemBox } from "../parts/problem_box";
 import { CheckTable } from "./check_table";
 import { Photos } from "./photos";
 import { Plan } from "./plan";
+import { answeredYes, AskedPoses } from "./pose_question";
 import { type SetPhotos, useSet } from "./set_photos";
 
 /** Options chosen before a set was masked, by the id of the masked one. */
@@ -28,6 +29,11 @@ export function NewJob({ dataset }: { dataset: DatasetView }) {
   const leaveOut = (names: ReadonlySet<string>) => {
     setValues(({ leave_out: _, ...others }) => (names.size ? { ...others, leave_out: [...names] } : others));
   };
+  const question = report.pose_question;
+  const converted = answeredYes(question, values);
+  const convert = (yes: boolean) => {
+    setValues(({ given_poses: _, ...others }) => (yes && question ? { ...others, given_poses: question.given_poses } : others));
+  };
   const masks = useMasks(dataset, photos?.list ?? null, (id) => {
     carried.set(id, values);
     location.hash = `#/datasets/${id}`;
@@ -42,10 +48,11 @@ export function NewJob({ dataset }: { dataset: DatasetView }) {
         <CheckTable dataset={dataset} />
         <Plan report={report} values={values} leftOut={leftOut.size} />
       </div>
+      {question && <AskedPoses question={question} yes={converted} onAnswer={convert} />}
       {photos && (
         <div class="set-views">
           <Photos {...{ photos, leftOut, masks }} onChange={leaveOut} />
-          {report.with_pose > 0 && <Cameras photos={photos} />}
+          {report.with_pose > 0 && <Cameras photos={photos} converted={converted} />}
         </div>
       )}
       <form
@@ -71,21 +78,21 @@ export function NewJob({ dataset }: { dataset: DatasetView }) {
 }
 
 /** The given cameras in three dimensions; the code for it is loaded for sets that have poses. */
-function Cameras({ photos: { list, cellOf } }: { photos: SetPhotos }) {
+function Cameras({ photos: { list, cellOf }, converted }: { photos: SetPhotos; converted: boolean }) {
   const { value: widgets } = useLoaded(() => import("../job/widgets"), once, []);
   const [selected, setSelected] = useState<number | null>(null);
   const posed = useMemo(() => list.photos.flatMap(({ world_from_cam }, index) => (world_from_cam ? [index] : [])), [list]);
   const cameras = useMemo<SceneCamera[]>(() => {
     const borders = list.cameras.map(bordersOf);
     return posed.map((index) => {
-      const { name, camera, world_from_cam } = list.photos[index]!;
-      const pose = world_from_cam!;
+      const { name, camera, world_from_cam, read_as_asked } = list.photos[index]!;
+      const pose = (converted && read_as_asked) || world_from_cam!;
       return {
         ...{ name, before: null, after: pose, returned: pose, source: "given", borders: borders[camera]! },
         ...{ moved_deg: 0, moved_units: 0, delta_psnr: null, flags: [], uncertainty: null },
       };
     });
-  }, [list, posed]);
+  }, [list, posed, converted]);
   const cellOfPosed = useMemo(() => (camera: number) => cellOf(posed[camera]!), [cellOf, posed]);
   return (
     <section class="card panel-scene" aria-labelledby="given-heading">

@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
@@ -16,6 +17,7 @@ from biresnerf.commands.poses.make_scene import make_scene_command
 from biresnerf.data.seeding.match_poses import can_match
 from biresnerf.errors import InputError
 from tests.data.formats.simple import trajectories
+from tests.data.given_poses.views import around, written
 from tests.data.scenes import write_image
 
 
@@ -67,6 +69,19 @@ def test_photos_alone_are_told_where_their_poses_would_come_from(
     found = inspected(tmp_path, "--set", f"start={start}")
     assert (found["format"], found["with_pose"]) == ("images", 0)
     assert said in found["plan"]["start"]
+
+
+def test_poses_with_other_axes_are_asked_about_until_they_are_said_to_be_so(tmp_path: Path) -> None:
+    written(tmp_path / "right", around())
+    assert inspected(tmp_path / "right")["pose_question"] is None
+    written(tmp_path / "wrong", around() @ np.diag([1.0, -1, -1, 1]), around())
+    question = inspected(tmp_path / "wrong")["pose_question"]
+    assert question["given_poses"] == ["opencv_axes"]
+    assert "have OpenCV's axes" in question["question"]
+    said = CliRunner().invoke(inspect_command, [str(tmp_path / "wrong")]).output
+    assert question["question"] in said
+    assert "If so: --set given_poses=opencv_axes" in said
+    assert inspected(tmp_path / "wrong", "--set", "given_poses=opencv_axes")["pose_question"] is None
 
 
 def test_damage_is_found_where_pixels_are_asked_for(tmp_path: Path) -> None:

@@ -16,8 +16,9 @@ from biresnerf.data.photos.masks import load_mask
 from biresnerf.errors import InputError
 from biresnerf.forecast import RATES, remember_rates
 from biresnerf.options.presets import PRESETS
-from biresnerf.wire.datasets import CheckedPhoto, PhotoList
+from biresnerf.wire.datasets import CheckedPhoto, CheckReport, PhotoList
 from tests.data.formats.simple import trajectories
+from tests.data.given_poses.views import around, written
 from tests.data.scenes import nerfstudio_scene, save, write_image
 from workers.datasets import dataset_check_process
 from workers.records import FIRST_PHOTO, PHOTO_LIST, PHOTO_SHEET, shown_folder
@@ -36,7 +37,7 @@ def test_what_was_found_is_counted(tmp_path: Path) -> None:
         "images": 4, "with_pose": 3, "without_pose": 1, "poses": "partial", "cameras": 1,
         "camera_models": ["PINHOLE"], "intrinsics": ["given"], "format": "colmap", "masks": 1, "transparency": False,
         "warnings": ["1 of 4 images have no pose yet: d.png", "masks were found for 1 of 4 images"],
-        "expected_s": TIMES,
+        "pose_question": None, "expected_s": TIMES,
     }  # fmt: skip
 
 
@@ -67,6 +68,26 @@ def test_what_pages_show_is_left_beside_the_set(tmp_path: Path) -> None:
         assert np.argmin(apart) == index
     with Image.open(shown / FIRST_PHOTO) as first, Image.open(dataset.frames[0].path) as photo:
         assert first.size == photo.size
+
+
+def test_poses_that_seem_to_be_inverted_are_asked_about_and_shown_both_ways(tmp_path: Path) -> None:
+    turn = np.diag([1.0, -1, -1, 1])
+    poses = around()
+    written(tmp_path / "set", np.linalg.inv(poses @ turn) @ turn, poses)
+    report = CheckReport.model_validate(check(tmp_path / "set"))
+    assert report.pose_question is not None
+    assert report.pose_question.given_poses == ("inverted",)
+    found = PhotoList.model_validate_json((shown_folder(tmp_path / "set") / PHOTO_LIST).read_bytes())
+    dataset = read_dataset(tmp_path / "set")
+    for photo, pose, frame in zip(found.photos, poses, dataset.frames, strict=True):
+        np.testing.assert_allclose(photo.world_from_cam, frame.world_from_cam[:3])
+        np.testing.assert_allclose(photo.read_as_asked, pose[:3], atol=1e-9)
+
+
+def test_copies_of_a_photo_are_named(tmp_path: Path) -> None:
+    trajectories.write_images(tmp_path)
+    (tmp_path / "images/copy.png").write_bytes((tmp_path / "images/a.png").read_bytes())
+    assert any("copy.png (of " in text for text in check(tmp_path)["warnings"])
 
 
 def test_the_expected_time_is_that_of_the_latest_machine(

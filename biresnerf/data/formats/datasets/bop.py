@@ -29,6 +29,7 @@ BOP = Format(
     suffixes=(".json",),
     gives="lenses, and poses (mm) where it has cam_R_w2c",
     checked_against="its description; Feo-cat/TransparentObjectPose, patricksko/PoseEstimator",
+    cam_from_world=True,
 )
 _HINT = "Give the scene_camera.json of the scene."
 _Nine: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]

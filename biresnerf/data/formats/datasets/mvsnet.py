@@ -25,6 +25,7 @@ MVSNET = Format(
     found_as=("cams",),
     gives="poses, one lens an image",
     checked_against="its source; LiangliangNan/RealCameraViewer",
+    cam_from_world=True,
 )
 _HINT = "Give an extrinsic matrix of 4 rows and an intrinsic one of 3, each below its name."
 _SUFFIX = "_cam.txt"

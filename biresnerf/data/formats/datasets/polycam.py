@@ -29,6 +29,7 @@ POLYCAM = Format(
     found_as=("keyframes/corrected_cameras", "corrected_cameras", "keyframes/cameras", "cameras"),
     gives="poses and lenses, those that Polycam corrected where it has them",
     checked_against="nerfstudio's reader",
+    axes="opengl",
 )
 _HINT = "Export the raw data from Polycam again."
 _PHOTOS = {"corrected_cameras": "corrected_images", "cameras": "images"}

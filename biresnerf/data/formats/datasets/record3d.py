@@ -31,6 +31,8 @@ RECORD3D = Format(
     suffixes=(".json",),
     gives="poses; lenses, one an image where the app kept them",
     checked_against="nerfstudio's reader; YaroslavGladun/door_handle_detection",
+    axes="opengl",
+    quaternion="xyzw",
 )
 _HINT = "Export the capture from Record3D again (RGBD frames and metadata)."
 _Coefficients: TypeAlias = tuple[float, float, float, float]

@@ -44,6 +44,7 @@ OPENSFM = Format(
     suffixes=(".json",),
     gives="poses and lenses of the largest reconstruction",
     checked_against="its writer; arjunkurup/sfm-data-bathtub",
+    cam_from_world=True,
     in_set="reconstruction.json",
     loses=("rigs", "mask paths"),
     instead="pinhole",

@@ -40,6 +40,7 @@ REALITYCAPTURE = Format(
     suffixes=(".csv",),
     gives="poses and lenses, from a csv of internal and external camera parameters; poses, of omega, phi, kappa",
     checked_against="its writer; KU-Leuven-Geomatics/geomapi (omega, phi, kappa)",
+    axes="opengl",
     in_set="realitycapture.csv",
     loses=("rigs", "points", "mask paths"),
     instead="pinhole",

@@ -31,6 +31,7 @@ NERFSTUDIO = Format(
     suffixes=(".json",),
     gives="poses and intrinsics, as a transforms.json",
     checked_against="its writer",
+    axes="opengl",
     in_set="transforms_nerfstudio.json",
     always=True,
     loses=("rigs", "mask paths"),

@@ -58,6 +58,7 @@ TUM = Format(
     loses=("lenses", "rigs", "points", "mask paths"),
     heading="For evo and SLAM tools",
     hint="A trajectory in TUM format",
+    quaternion="xyzw",
 )
 KITTI = Format(
     name="kitti",

@@ -30,6 +30,7 @@ INSTANT_NGP = Format(
     suffixes=(".json",),
     gives="poses and intrinsics, as a transforms.json",
     checked_against="its writer",
+    axes="opengl",
     in_set="transforms_ngp.json",
     loses=("rigs", "points", "mask paths"),
     instead="pinhole",

@@ -30,6 +30,7 @@ TRANSFORMS = Format(
     suffixes=(".json",),
     gives="poses (also for some images only), shared or per-frame intrinsics, masks",
     checked_against="files of each dialect; published sets",
+    axes="opengl",
     in_set="transforms.json",
     always=True,
     needs=("input",),

@@ -1,0 +1,1 @@
+"""Whether given poses mean what their format says: other readings of them, and which of these the photos bear out."""
