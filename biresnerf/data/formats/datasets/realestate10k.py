@@ -31,6 +31,7 @@ REALESTATE10K = Format(
     suffixes=(".txt",),
     gives="poses and lenses",
     checked_against="its description",
+    cam_from_world=True,
 )
 _HINT = "Give lines of 19 numbers: time, fx, fy, cx, cy, 0, 0, and [R | t] of world to camera by rows."
 _COLUMNS = 19

@@ -32,6 +32,7 @@ SCANNER_APP = Format(
     found_as=(".",),
     gives="poses and lenses of the frames that have a photo",
     checked_against="a real capture, laanlabs/3dScannerApp_samples",
+    axes="opengl",
 )
 _HINT = "Export all data from the app again."
 _FRAMES = "frame_*.json"
