@@ -15,7 +15,7 @@ NEAR_AXIS = 1e-16  # squared radians, as in the geometry
 
 @njit(nogil=True, cache=True, error_model="numpy", inline="always")
 def _undistorted(x0, y0, c):
-    """The position that a lens with coefficients c [9] distorts to (x0, y0), by Newton's method."""
+    """The position that a lens with coefficients c [11] distorts to (x0, y0), by Newton's method."""
     x, y = x0, y0
     for _ in range(NEWTON_STEPS):
         s = x * x + y * y
@@ -23,14 +23,16 @@ def _undistorted(x0, y0, c):
         radial = ((((c[3] * s + c[2]) * s + c[1]) * s + c[0]) * s + 1.0) / below
         slope = ((4.0 * c[3] * s + 3.0 * c[2]) * s + 2.0 * c[1]) * s + c[0]
         slope = 2.0 * (slope - radial * ((3.0 * c[6] * s + 2.0 * c[5]) * s + c[4])) / below
-        error_x = x * radial + 2.0 * c[7] * x * y + c[8] * (s + 2.0 * x * x) - x0
-        error_y = y * radial + 2.0 * c[8] * x * y + c[7] * (s + 2.0 * y * y) - y0
-        xx = radial + slope * x * x + 2.0 * c[7] * y + 6.0 * c[8] * x
-        yy = radial + slope * y * y + 2.0 * c[8] * x + 6.0 * c[7] * y
+        error_x = x * radial + 2.0 * c[7] * x * y + c[8] * (s + 2.0 * x * x) + c[9] * s - x0
+        error_y = y * radial + 2.0 * c[8] * x * y + c[7] * (s + 2.0 * y * y) + c[10] * s - y0
+        xx = radial + slope * x * x + 2.0 * c[7] * y + (6.0 * c[8] + 2.0 * c[9]) * x
+        yy = radial + slope * y * y + 2.0 * c[8] * x + (6.0 * c[7] + 2.0 * c[10]) * y
         xy = slope * x * y + 2.0 * c[7] * x + 2.0 * c[8] * y
-        determinant = xx * yy - xy * xy
+        yx = xy + 2.0 * c[10] * x
+        xy += 2.0 * c[9] * y
+        determinant = xx * yy - xy * yx
         step_x = (yy * error_x - xy * error_y) / determinant
-        step_y = (xx * error_y - xy * error_x) / determinant
+        step_y = (xx * error_y - yx * error_x) / determinant
         x, y = x - step_x, y - step_y
         if abs(step_x) + abs(step_y) < NEWTON_DONE:
             break

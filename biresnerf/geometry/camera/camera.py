@@ -25,7 +25,7 @@ from biresnerf.geometry.camera.distortion import (
 from biresnerf.geometry.camera.lens import lens_reach
 
 # Columns of `Intrinsics.distortion`: numerator, denominator, tangential.
-ABOVE, BELOW, TANGENTIAL = slice(0, 4), slice(4, 7), slice(7, 9)
+ABOVE, BELOW, TANGENTIAL = slice(0, 4), slice(4, 7), slice(7, 11)
 # Radians from the axis: closer to it, series replace quotients with a gradient of 0 / 0.
 _NEAR_AXIS = 1e-8
 
@@ -36,8 +36,8 @@ class Intrinsics:
 
     Attributes:
         fx, fy, cx, cy: float64 [images], px.
-        distortion: float64 [images, 9]: coefficients of the radial factor's numerator (4) and denominator (3), and
-            p1, p2, as in `biresnerf.geometry.camera.distortion`.
+        distortion: float64 [images, 11]: coefficients of the radial factor's numerator (4) and denominator (3), and
+            p1, p2, sx1, sy1, as in `biresnerf.geometry.camera.distortion`.
         fisheye: bool [images].
         reach: float64 [images]: radius, on the plane of directions, about all that the image shows.
         width, height: int64 [images], px.
@@ -69,7 +69,7 @@ class Intrinsics:
         count = len(full)
         table = torch.tensor([f[:4] for f in full], dtype=torch.float64).reshape(count, 4)
         rows = [(*c.above, *c.below, *c.tangential) for c in coefficients]
-        distortion = torch.tensor(rows, dtype=torch.float64).reshape(count, 9)
+        distortion = torch.tensor(rows, dtype=torch.float64).reshape(count, 11)
         reach = [lens_reach(f, c.width, c.height) for f, c in zip(full, cameras, strict=True)]
         sizes = torch.tensor([(c.width, c.height) for c in cameras], dtype=torch.int64).reshape(count, 2)
         fx, fy, cx, cy = (column.contiguous() for column in table.unbind(1))
@@ -221,12 +221,13 @@ def _to_plane(i: Intrinsics, image_index: Tensor, points: Tensor) -> tuple[Tenso
 
 
 def _terms(distortion: Tensor) -> tuple[int, int, int]:
-    """How many leading columns of each group hold anything but zeros; p1 and p2 go together."""
+    """How many leading columns of each group hold anything but zeros; of the last, pairs go together."""
     used = (distortion != 0).any(0)
     above, below = (
         int((used[part].nonzero().max() + 1) if used[part].any() else 0) for part in (ABOVE, BELOW)
     )
-    return above, below, 2 if bool(used[TANGENTIAL].any()) else 0
+    prism, tangential = bool(used[9:].any()), bool(used[TANGENTIAL].any())
+    return above, below, 4 if prism else 2 if tangential else 0
 
 
 def _require(image_index: Tensor, values: Tensor, columns: int) -> None:

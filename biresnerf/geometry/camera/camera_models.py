@@ -2,7 +2,8 @@
 
 Two families. The perspective one is a special case of FULL_OPENCV: two focal lengths, a principal point, radial
 coefficients of a rational function (k1 to k3 above, k4 to k6 below) and two tangential ones (p1, p2). The fisheye
-one is a special case of OPENCV_FISHEYE: k1 to k4 are the coefficients of a polynomial in the angle from the axis.
+one is a special case of THIN_PRISM_FISHEYE: k1 to k4 are the coefficients of a polynomial in the angle from the axis,
+sx1 and sy1 those of a thin prism.
 Lengths are in pixels; the centre of the first pixel lies at (0.5, 0.5).
 """
 
@@ -30,16 +31,19 @@ MODEL_PARAMETERS: dict[str, tuple[str, ...]] = {
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
     "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
+    "THIN_PRISM_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"),
+    "SIMPLE_FISHEYE": ("f", "cx", "cy"),
+    "FISHEYE": ("fx", "fy", "cx", "cy"),
 }
 MODEL_IDS = {name: number for number, name in enumerate(COLMAP_MODELS) if name in MODEL_PARAMETERS}
 FISHEYE_MODELS = frozenset(name for name in MODEL_PARAMETERS if name.endswith("FISHEYE"))
 # If the requested model cannot represent a camera, the first of these that can is used; those of one focal length where
 # the requested one has one.
 _ONE_FOCAL = ("SIMPLE_RADIAL", "RADIAL", "RADIAL_FISHEYE")
-_FALLBACKS = ("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
+_FALLBACKS = ("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE")
 
 
-COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "sx1", "sy1")
 
 
 class FullParameters(NamedTuple):
@@ -60,6 +64,8 @@ class FullParameters(NamedTuple):
     k4: float = 0.0
     k5: float = 0.0
     k6: float = 0.0
+    sx1: float = 0.0
+    sy1: float = 0.0
     fisheye: bool = False
 
     @property
@@ -90,14 +96,14 @@ def smallest_model(full: FullParameters, preferred: str | None) -> tuple[str, tu
     """``preferred`` where it holds ``full`` without loss, else one that does; with its parameters.
 
     Raises:
-        ValueError: no model does: a fisheye with p1, p2, k5 or k6.
+        ValueError: no model does: a fisheye with k5 or k6, or another lens with sx1 or sy1.
     """
     order: tuple[str, ...] = _FALLBACKS
     if preferred is not None:
         order = (preferred, *(_ONE_FOCAL if "f" in MODEL_PARAMETERS[preferred] else ()), *_FALLBACKS)
     model = next((name for name in order if _holds(name, full)), None)
     if model is None:
-        raise ValueError("no camera model holds a fisheye lens with p1, p2, k5 or k6")
+        raise ValueError("no camera model holds a fisheye lens with k5 or k6, or another one with sx1 or sy1")
     values = full._asdict() | {"f": full.fx}
     return model, tuple(values[name] for name in MODEL_PARAMETERS[model])
 

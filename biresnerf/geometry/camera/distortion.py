@@ -3,11 +3,11 @@
 All lenses share one form. A viewing direction is put on a plane: by its slopes X/Z, Y/Z for a perspective lens, by
 its angle from the axis, in radians and in its own direction, for a fisheye. With r the distance from the centre there,
 
-    x' = x g(r²) + 2 p1 x y + p2 (r² + 2 x²)
-    y' = y g(r²) + 2 p2 x y + p1 (r² + 2 y²)
+    x' = x g(r²) + 2 p1 x y + p2 (r² + 2 x²) + sx1 r²
+    y' = y g(r²) + 2 p2 x y + p1 (r² + 2 y²) + sy1 r²
     g(s) = (1 + a1 s + a2 s² + a3 s³ + a4 s⁴) / (1 + b1 s + b2 s² + b3 s³)
 
-which is COLMAP's FULL_OPENCV with a = (k1, k2, k3), b = (k4, k5, k6) and its OPENCV_FISHEYE with a = (k1, ..., k4).
+which is COLMAP's FULL_OPENCV with a = (k1, k2, k3), b = (k4, k5, k6) and its THIN_PRISM_FISHEYE with a = (k1, ..., k4).
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ Array = TypeVar("Array", bound=Any)
 
 
 class Coefficients(NamedTuple):
-    """Coefficients of the radial factor's numerator and denominator, and p1, p2.
+    """Coefficients of the radial factor's numerator and denominator, and p1, p2, sx1, sy1.
 
-    Each is a number or an array that fits the points. Trailing zeros, or p1 and p2, may be left out.
+    Each is a number or an array that fits the points. Trailing zeros, or pairs of the last four, may be left out.
     """
 
     above: Sequence[Any]
@@ -38,11 +38,12 @@ class Coefficients(NamedTuple):
 
 
 def coefficients_of(full: FullParameters) -> Coefficients:
-    """The coefficients of either family of lenses in their common form, none left out: 4, 3 and 2."""
+    """The coefficients of either family of lenses in their common form, none left out: 4, 3 and 4."""
+    across = (full.p1, full.p2, full.sx1, full.sy1)
     if full.fisheye:
-        return Coefficients((full.k1, full.k2, full.k3, full.k4), (0.0, 0.0, 0.0), (0.0, 0.0))
+        return Coefficients((full.k1, full.k2, full.k3, full.k4), (0.0, 0.0, 0.0), across)
     below = (full.k4, full.k5, full.k6)
-    return Coefficients((full.k1, full.k2, full.k3, 0.0), below, (full.p1, full.p2))
+    return Coefficients((full.k1, full.k2, full.k3, 0.0), below, across)
 
 
 def distort(x: Array, y: Array, c: Coefficients) -> tuple[Array, Array]:
@@ -53,13 +54,15 @@ def distort(x: Array, y: Array, c: Coefficients) -> tuple[Array, Array]:
         radial = radial / _series(s, c.below)
     u, v = x * radial, y * radial
     if c.tangential:
-        p1, p2 = c.tangential
+        p1, p2 = c.tangential[:2]
         u, v = u + 2 * p1 * x * y + p2 * (s + 2 * x * x), v + 2 * p2 * x * y + p1 * (s + 2 * y * y)
+    if len(c.tangential) > 2:
+        u, v = u + c.tangential[2] * s, v + c.tangential[3] * s
     return u, v
 
 
-def distort_jacobian(x: Array, y: Array, c: Coefficients) -> tuple[Array, Array, Array]:
-    """Derivatives of `distort`: of x' by x, of x' by y (and of y' by x, which is the same), of y' by y."""
+def distort_jacobian(x: Array, y: Array, c: Coefficients) -> tuple[Array, Array, Array, Array]:
+    """Derivatives of `distort`: of x' by x and by y, of y' by x and by y."""
     s = x * x + y * y
     radial, slope = _series(s, c.above), 2 * _series_slope(s, c.above)
     if c.below:
@@ -68,11 +71,15 @@ def distort_jacobian(x: Array, y: Array, c: Coefficients) -> tuple[Array, Array,
         slope = (slope - radial * 2 * _series_slope(s, c.below)) / below
     xx, xy, yy = radial + slope * x * x, slope * x * y, radial + slope * y * y
     if c.tangential:
-        p1, p2 = c.tangential
+        p1, p2 = c.tangential[:2]
         xx = xx + 2 * p1 * y + 6 * p2 * x
         xy = xy + 2 * p1 * x + 2 * p2 * y
         yy = yy + 2 * p2 * x + 6 * p1 * y
-    return xx, xy, yy
+    yx = xy
+    if len(c.tangential) > 2:
+        sx, sy = 2 * c.tangential[2], 2 * c.tangential[3]
+        xx, xy, yx, yy = xx + sx * x, xy + sx * y, yx + sy * x, yy + sy * y
+    return xx, xy, yx, yy
 
 
 def newton_step(x: Array, y: Array, to_x: Array, to_y: Array, c: Coefficients) -> tuple[Array, Array]:
@@ -81,11 +88,11 @@ def newton_step(x: Array, y: Array, to_x: Array, to_y: Array, c: Coefficients) -
     return solve(distort_jacobian(x, y, c), now_x - to_x, now_y - to_y)
 
 
-def solve(jacobian: tuple[Array, Array, Array], u: Array, v: Array) -> tuple[Array, Array]:
+def solve(jacobian: tuple[Array, Array, Array, Array], u: Array, v: Array) -> tuple[Array, Array]:
     """The inverse of a Jacobian as `distort_jacobian` gives it, applied to (u, v)."""
-    xx, xy, yy = jacobian
-    determinant = xx * yy - xy * xy
-    return (yy * u - xy * v) / determinant, (xx * v - xy * u) / determinant
+    xx, xy, yx, yy = jacobian
+    determinant = xx * yy - xy * yx
+    return (yy * u - xy * v) / determinant, (xx * v - yx * u) / determinant
 
 
 def undistort(to_x: Array, to_y: Array, c: Coefficients) -> tuple[Array, Array]:

@@ -66,8 +66,8 @@ def _border_seen(full: FullParameters, width: int, height: int) -> _Border:
     path = []
     for share in shares:
         for _ in range(_NEWTON_STEPS):
-            xx, across, yy = distort_jacobian(x, y, c)
-            if (xx * yy - across * across).min() < MIN_MAGNIFICATION:
+            xx, xy, yx, yy = distort_jacobian(x, y, c)
+            if (xx * yy - xy * yx).min() < MIN_MAGNIFICATION:
                 problem = (
                     "the distortion folds back inside the image, so its outer pixels have no viewing ray."
                 )

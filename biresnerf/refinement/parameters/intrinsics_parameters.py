@@ -31,7 +31,7 @@ from biresnerf.refinement.parameters.pose_parameters import dolly_directions
 BETAS, EPSILON = (0.9, 0.99), 1e-12
 # Expected standard deviations of the increments, and the weight of this prior in the loss: parameters without
 # evidence in the photos stay.
-DEVIATIONS = (0.2, 0.02, 0.05, 0.05, *(0.1,) * 9)
+DEVIATIONS = (0.2, 0.02, 0.05, 0.05, *(0.1,) * 11)
 PRIOR_WEIGHT = 1e-6
 
 

@@ -35,7 +35,7 @@ from tests.data.formats.readers import (
 )
 from tests.data.scenes import assert_complete
 
-NGP_MODELS = sorted(set(MODEL_PARAMETERS) - {"FULL_OPENCV"})
+NGP_MODELS = sorted(set(MODEL_PARAMETERS) - {"FULL_OPENCV", "THIN_PRISM_FISHEYE"})
 CLOSE_PX = 0.01
 
 

@@ -92,7 +92,16 @@ def test_directions_projection_and_ids_agree_with_colmap(model, colmap):
 small = st.floats(-1.0, 1.0, allow_nan=False)
 # How large a coefficient is drawn: real lenses of the kind, and beyond, to where `lens_problem` refuses.
 SIZES = {"k1": 1.5, "k2": 1.5, "p1": 0.1, "p2": 0.1, "k3": 1.0, "k4": 1.5, "k5": 1.5, "k6": 1.0}
-FISHEYE_SIZES = {"k1": 0.2, "k2": 0.1, "k3": 0.05, "k4": 0.02}
+FISHEYE_SIZES = {
+    "k1": 0.2,
+    "k2": 0.1,
+    "k3": 0.05,
+    "k4": 0.02,
+    "p1": 0.05,
+    "p2": 0.05,
+    "sx1": 0.05,
+    "sy1": 0.05,
+}
 
 
 @st.composite
@@ -196,8 +205,8 @@ def test_where_the_lens_formula_folds_back_into_the_image_nothing_is_in_view():
 def test_each_ray_takes_its_own_images_camera():
     cameras = [Camera(model, WIDTH, HEIGHT, params) for model, params in CAMERAS.items()]
     together = Intrinsics.from_cameras(cameras)
-    index = torch.arange(9).repeat(30)
-    pixels = torch.from_numpy(pixels_everywhere(270))
+    index = torch.arange(len(cameras)).repeat(30)
+    pixels = torch.from_numpy(pixels_everywhere(30 * len(cameras)))
     mixed = directions_in_cam(together, index, pixels)
     for number, camera in enumerate(cameras):
         rows = index == number
@@ -234,12 +243,14 @@ def test_shapes_that_do_not_fit_are_refused():
         project(intrinsics, torch.zeros(4, dtype=torch.int64), torch.zeros(4, 2))
 
 
-@pytest.mark.parametrize("model", ["PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"])
+@pytest.mark.parametrize(
+    "model", ["PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"]
+)
 def test_gradients_by_the_intrinsics_are_those_of_finite_differences(model):
     """Also where every coefficient is zero, and at the principal point."""
     for params in (CAMERAS[model], CAMERAS[model][:4] + (0.0,) * (len(CAMERAS[model]) - 4)):
         start = one_camera(model, params)
-        start = replace(start, terms=(4, 3, 2) if model != "PINHOLE" else start.terms)
+        start = replace(start, terms=(4, 3, 4) if model != "PINHOLE" else start.terms)
         pixels = torch.from_numpy(np.concatenate([pixels_everywhere(6), [params[2:4]]]))
         index = torch.zeros(len(pixels), dtype=torch.int64)
 
@@ -264,3 +275,4 @@ def test_rays_are_computed_with_as_many_terms_as_the_set_has():
     assert terms["OPENCV"] == (2, 0, 2)
     assert terms["FULL_OPENCV"] == (3, 3, 2)
     assert terms["OPENCV_FISHEYE"] == (4, 0, 0)
+    assert terms["THIN_PRISM_FISHEYE"] == (4, 0, 4)

@@ -28,13 +28,17 @@ def test_a_model_that_cannot_hold_the_camera_is_left_for_one_that_can():
     assert smallest_model(fisheye, "RADIAL_FISHEYE")[0] == "OPENCV_FISHEYE"
     assert smallest_model(fisheye, "OPENCV")[0] == "OPENCV_FISHEYE"
     assert smallest_model(fisheye, None)[0] == "OPENCV_FISHEYE"
+    assert smallest_model(fisheye._replace(p1=0.1), None)[0] == "THIN_PRISM_FISHEYE"
     with pytest.raises(ValueError, match="fisheye"):
-        smallest_model(fisheye._replace(p1=0.1), None)
+        smallest_model(fisheye._replace(k5=0.1), None)
+    with pytest.raises(ValueError, match="sx1"):
+        smallest_model(FullParameters(500, 500, 320, 240, sx1=0.1), None)
+    assert smallest_model(FullParameters(500, 500, 320, 240, k2=0.1), "SIMPLE_RADIAL")[0] == "RADIAL"
 
 
 def test_unknown_models_and_wrong_counts_are_refused():
     with pytest.raises(ValueError, match="OPENCV_FISHEYE"):
-        full_parameters("THIN_PRISM_FISHEYE", (1.0,) * 12)
+        full_parameters("EUCM", (1.0,) * 6)
     for model, names in MODEL_PARAMETERS.items():
         with pytest.raises(ValueError, match="parameters"):
             full_parameters(model, (1.0,) * (len(names) + 1))

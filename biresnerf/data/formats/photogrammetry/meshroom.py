@@ -46,7 +46,7 @@ MESHROOM = Format(
     in_set="cameras.sfm",
     loses=("rigs", "mask paths"),
     instead="pinhole",
-    lacks="two focal lengths; FULL_OPENCV beyond k3",
+    lacks="two focal lengths; FULL_OPENCV beyond k3; THIN_PRISM_FISHEYE",
     heading="For Meshroom",
     hint="Poses, lenses and points for AliceVision's nodes; paths are relative to the photos' folder",
 )

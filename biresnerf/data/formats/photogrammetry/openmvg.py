@@ -42,7 +42,7 @@ OPENMVG = Format(
     in_set="sfm_data.json",
     loses=("rigs", "mask paths"),
     instead="pinhole",
-    lacks="two focal lengths; FULL_OPENCV beyond k3; colours of points",
+    lacks="two focal lengths; FULL_OPENCV beyond k3; THIN_PRISM_FISHEYE; colours of points",
     heading="For OpenMVG",
     hint="Set the root path in it to the folder of the photos",
 )

@@ -48,7 +48,7 @@ OPENSFM = Format(
     in_set="reconstruction.json",
     loses=("rigs", "mask paths"),
     instead="pinhole",
-    lacks="FULL_OPENCV beyond k3",
+    lacks="FULL_OPENCV beyond k3; THIN_PRISM_FISHEYE",
     heading="For OpenSfM, OpenDroneMap",
     hint="Put it into the folder of the project; photos are in its images/",
 )

@@ -20,7 +20,7 @@ from biresnerf.data.model.conventions import file_from_world_from_cam
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.errors import InputError
-from biresnerf.geometry.camera.camera_models import Camera
+from biresnerf.geometry.camera.camera_models import COEFFICIENTS, Camera
 from biresnerf.options.formats import Format
 
 NERFSTUDIO = Format(
@@ -37,7 +37,7 @@ NERFSTUDIO = Format(
     loses=("rigs", "mask paths"),
     splats=True,
     instead="pinhole",
-    lacks="FULL_OPENCV beyond k3; fisheyes beside other lenses",
+    lacks="FULL_OPENCV beyond k3; THIN_PRISM_FISHEYE; fisheyes beside other lenses",
     heading="For nerfstudio",
     hint="With points.ply beside it in the folder of the photos: ns-train splatfacto --data FILE",
 )
@@ -46,6 +46,7 @@ NERFSTUDIO = Format(
 _RADIAL = ("k1", "k2", "k3", "k4")
 _BROWN = (*_RADIAL, "p1", "p2")
 _BEYOND = ("k4", "k5", "k6")  # the rational model's, of which nerfstudio knows nothing
+_BEYOND_FISHEYE = ("p1", "p2", "sx1", "sy1")  # the thin prism's
 
 
 def write_nerfstudio(refined: RefinedSet, path: Path, dataset: Dataset | None = None) -> None:
@@ -83,9 +84,9 @@ def write_nerfstudio(refined: RefinedSet, path: Path, dataset: Dataset | None = 
 
 def _lens(camera: Camera) -> dict[str, Any]:
     full = camera.full()
-    if not full.fisheye and any(getattr(full, name) for name in _BEYOND):
+    if any(getattr(full, name) for name in (_BEYOND_FISHEYE if full.fisheye else _BEYOND)):
         raise _impossible(f"it has no lens with all coefficients of {camera.model}")
-    values = {key: value for key, value in lens_values(camera).items() if key not in (*_BROWN, *_BEYOND)}
+    values = {key: value for key, value in lens_values(camera).items() if key not in COEFFICIENTS}
     coefficients = _RADIAL if full.fisheye else _BROWN if full.distorted else ()
     return values | {name: getattr(full, name) for name in coefficients}
 

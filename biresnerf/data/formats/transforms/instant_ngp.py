@@ -34,7 +34,7 @@ INSTANT_NGP = Format(
     in_set="transforms_ngp.json",
     loses=("rigs", "points", "mask paths"),
     instead="pinhole",
-    lacks="FULL_OPENCV; WebP and TIFF images",
+    lacks="FULL_OPENCV; THIN_PRISM_FISHEYE; WebP and TIFF images",
     heading="For instant-ngp",
     hint="Put it into the folder of the photos and open it in instant-ngp",
 )

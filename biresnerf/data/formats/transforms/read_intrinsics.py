@@ -16,6 +16,7 @@ from biresnerf.geometry.camera.camera_models import (
     COEFFICIENTS,
     FISHEYE_MODELS,
     MODEL_IDS,
+    MODEL_PARAMETERS,
     Camera,
     FullParameters,
     smallest_model,
@@ -171,13 +172,20 @@ def _declared_size(fields: Fields, header: ImageHeader, name: str) -> tuple[int,
 def _coefficients(fields: Fields, model: str | None, fisheye: bool) -> dict[str, float]:
     """Distortion by the names of `FullParameters`. Raises InputError for a term that the lens's model lacks."""
     values = {key: fields.get(key) or 0.0 for key in COEFFICIENTS}
+    for key in () if fisheye else ("sx1", "sy1"):
+        if values[key]:
+            raise _unsupported(fields, key, f"{key} is not zero, but only THIN_PRISM_FISHEYE has it.")
     if model == "FULL_OPENCV":
         return values
     if fisheye:
         # instant-ngp keeps p1 and p2 in the places of k3 and k4, and the last one wins, which is never meant.
-        for key in ("p1", "p2", "k5", "k6"):
+        thin_prism = model == "THIN_PRISM_FISHEYE"
+        for key in ("k5", "k6") if thin_prism else ("p1", "p2", "k5", "k6", "sx1", "sy1"):
             if values[key]:
-                raise _unsupported(fields, key, f"{key} is not zero, but a fisheye has k1 to k4 only.")
+                has = MODEL_PARAMETERS["THIN_PRISM_FISHEYE" if thin_prism else "OPENCV_FISHEYE"][4:]
+                raise _unsupported(
+                    fields, key, f"{key} is not zero, but such a fisheye has {', '.join(has)} only."
+                )
         return values
     for key in ("k4", "k5", "k6"):
         if values[key]:

@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from biresnerf.geometry.camera.camera_models import COEFFICIENTS, Camera, FullParameters
+from biresnerf.geometry.camera.camera_models import COEFFICIENTS, MODEL_PARAMETERS, Camera, FullParameters
 
 FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
+_COLMAPS = ("FULL_OPENCV", "THIN_PRISM_FISHEYE")
 
 
 def family(camera: Camera) -> str:
-    """``camera_model`` of the file; FULL_OPENCV, which nerfstudio does not know, where nothing less will do."""
-    if camera.full().fisheye:
-        return "OPENCV_FISHEYE"
-    return "FULL_OPENCV" if camera.model == "FULL_OPENCV" else "OPENCV"
+    """``camera_model`` of the file; one of `_COLMAPS`, which nerfstudio does not know, where nothing less will do."""
+    if camera.model in _COLMAPS:
+        return camera.model
+    return "OPENCV_FISHEYE" if camera.full().fisheye else "OPENCV"
 
 
 def lens_values(camera: Camera) -> dict[str, Any]:
@@ -22,7 +23,7 @@ def lens_values(camera: Camera) -> dict[str, Any]:
     p = camera.full()
     values: dict[str, Any] = {"w": camera.width, "h": camera.height}
     values |= {"fl_x": p.fx, "fl_y": p.fy, "cx": p.cx, "cy": p.cy}
-    names = ngp_coefficients(p) if camera.model != "FULL_OPENCV" else COEFFICIENTS
+    names = ngp_coefficients(p) if camera.model not in _COLMAPS else MODEL_PARAMETERS[camera.model][4:]
     return values | {name: getattr(p, name) for name in names}
 
 

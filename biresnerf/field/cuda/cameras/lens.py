@@ -37,23 +37,26 @@ def directions(
     y0 = y0 / tl.load(fy + m, mask=here, other=1.0)
     x, y = x0, y0
     if STEPS > 0:
-        a1, a2, a3 = load_vector(distortion + 9 * m, 1, here)
-        a4, b1, b2 = load_vector(distortion + 9 * m + 3, 1, here)
-        b3, p1, p2 = load_vector(distortion + 9 * m + 6, 1, here)
+        a1, a2, a3 = load_vector(distortion + 11 * m, 1, here)
+        a4, b1, b2 = load_vector(distortion + 11 * m + 3, 1, here)
+        b3, p1, p2 = load_vector(distortion + 11 * m + 6, 1, here)
+        sx = tl.load(distortion + 11 * m + 9, mask=here, other=0.0)
+        sy = tl.load(distortion + 11 * m + 10, mask=here, other=0.0)
         for _ in range(STEPS):
             s = x * x + y * y
             below = ((b3 * s + b2) * s + b1) * s + 1.0
             radial = ((((a4 * s + a3) * s + a2) * s + a1) * s + 1.0) / below
             slope = ((a4 * s * 4.0 + a3 * 3.0) * s + a2 * 2.0) * s + a1
             slope = (slope - radial * ((b3 * s * 3.0 + b2 * 2.0) * s + b1)) * 2.0 / below
-            error_x = x * radial + p1 * x * y * 2.0 + p2 * (s + x * x * 2.0) - x0
-            error_y = y * radial + p2 * x * y * 2.0 + p1 * (s + y * y * 2.0) - y0
-            xx = radial + slope * x * x + p1 * y * 2.0 + p2 * x * 6.0
-            yy = radial + slope * y * y + p2 * x * 2.0 + p1 * y * 6.0
+            error_x = x * radial + p1 * x * y * 2.0 + p2 * (s + x * x * 2.0) + sx * s - x0
+            error_y = y * radial + p2 * x * y * 2.0 + p1 * (s + y * y * 2.0) + sy * s - y0
+            xx = radial + slope * x * x + p1 * y * 2.0 + (p2 * 6.0 + sx * 2.0) * x
+            yy = radial + slope * y * y + p2 * x * 2.0 + (p1 * 6.0 + sy * 2.0) * y
             across = slope * x * y + p1 * x * 2.0 + p2 * y * 2.0
-            determinant = xx * yy - across * across
-            x -= (yy * error_x - across * error_y) / determinant
-            y -= (xx * error_y - across * error_x) / determinant
+            xy, yx = across + sx * y * 2.0, across + sy * x * 2.0
+            determinant = xx * yy - xy * yx
+            x -= (yy * error_x - xy * error_y) / determinant
+            y -= (xx * error_y - yx * error_x) / determinant
     s = x * x + y * y
     z = 1.0 / tl.sqrt(s + 1.0)
     scale = z

@@ -123,9 +123,9 @@ def slopes_seen(lens: Array, shown: Array) -> Array:
     for _ in range(NEWTON):
         x, y = found[..., 0], found[..., 1]
         away = np.stack(distort(x, y, c), -1) - aim
-        xx, xy, yy = distort_jacobian(x, y, c)
-        steep = np.maximum(xx * yy - xy * xy, LEAST_AREA)
-        step = np.stack([yy * away[..., 0] - xy * away[..., 1], xx * away[..., 1] - xy * away[..., 0]], -1)
+        xx, xy, yx, yy = distort_jacobian(x, y, c)
+        steep = np.maximum(xx * yy - xy * yx, LEAST_AREA)
+        step = np.stack([yy * away[..., 0] - xy * away[..., 1], xx * away[..., 1] - yx * away[..., 0]], -1)
         found = found - step / steep[..., None]
         length = np.linalg.norm(found, axis=-1, keepdims=True)
         found = found * np.minimum(1.0, farthest / np.maximum(length, 1e-300))

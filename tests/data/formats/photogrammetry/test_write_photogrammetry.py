@@ -37,12 +37,10 @@ def with_values(refined, **values):
 
 
 def made(model, *, several=False, square=True):
-    """A result whose FULL_OPENCV is Brown's lens, and whose pixels are ``square`` where a format needs that."""
-    return (
-        with_values(random_result(21, model=model, several=several), k4=0.0, k5=0.0, k6=0.0, square=square)
-        if model == "FULL_OPENCV"
-        else with_values(random_result(21, model=model, several=several), square=square)
-    )
+    """A result without terms that only COLMAP has, and whose pixels are ``square`` where a format needs that."""
+    beyond = {"FULL_OPENCV": ("k4", "k5", "k6"), "THIN_PRISM_FISHEYE": ("p1", "p2", "sx1", "sy1")}
+    without = dict.fromkeys(beyond.get(model, ()), 0.0)
+    return with_values(random_result(21, model=model, several=several), **without, square=square)
 
 
 def brown(in_cam, k1=0.0, k2=0.0, k3=0.0, p1=0.0, p2=0.0):
