@@ -94,6 +94,11 @@ class Tie:
     likelihood: float
     price: float
 
+    def explains_more_than(self, other: Tie) -> bool:
+        """Whether this is to be believed in place of another tie of the same cameras, which is likelier before."""
+        counted = min(1.0, INDEPENDENT / len(self.weight))
+        return counted * (self.likelihood - other.likelihood) - (self.price - other.price) > STRONG
+
 
 def tie(fitted: Array, given: Array) -> Tie:
     """The frame that ties poses [n, 4, 4] of the same cameras together, and the offset that the given ones share.
@@ -114,9 +119,7 @@ def tie(fitted: Array, given: Array) -> Tie:
     if likeliest[0] != 0:
         found += poses.ties(_motion(AXES[likeliest[0]]), price=2 * math.log(len(AXES)))
     best = max(found, key=lambda each: each.likelihood - each.price)
-    some_count = min(1.0, INDEPENDENT / len(given))
-    gain = some_count * (best.likelihood - found[0].likelihood) - (best.price - found[0].price)
-    return best if gain > STRONG else found[0]
+    return best if best.explains_more_than(found[0]) else found[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,13 +146,14 @@ class _Pair:
     @property
     def spread(self) -> float:
         centres = self.given[:, :3, 3]
-        return float(np.linalg.norm(centres - centres.mean(0), axis=1).mean())
+        return max(float(np.linalg.norm(centres - centres.mean(0), axis=1).mean()), 1e-300)
 
     def likelihood(self, cam_from_body: Array) -> float:
         """Of the errors that an offset leaves, once the rigs are aligned."""
         bodies = self.fitted @ cam_from_body
         frame = align_robust(bodies, self.given, with_rotations=True)
-        return _likelihood(*_apart(self.given, frame.apply_to_poses(bodies)), EXACT * self.spread)
+        turned, shifted = _apart(self.given, frame.apply_to_poses(bodies))
+        return _likelihood(turned, shifted / self.spread)
 
     def ties(self, start: Array, *, turns: bool = False, price: float = 0.0) -> list[Tie]:
         """Without a shift, and with one along the axes of the body where it can be told.
@@ -192,8 +196,7 @@ class _Pair:
         # The offset's length is in the unit of the fitted poses; that of the given ones is asked for.
         body_from_cam[:3, 3] *= fit.frame.scale
         offset = None if np.array_equal(body_from_cam, np.eye(4)) else BodyOffset(body_from_cam, deviation)
-        likelihood = _likelihood(fit.turned, fit.shifted, EXACT * self.spread)
-        likelihood *= 2 / SHARED_ERRORS**2
+        likelihood = 2 * _likelihood(fit.turned, fit.shifted / self.spread) / SHARED_ERRORS**2
         return Tie(fit.frame, offset, fit.rotation, fit.position, fit.weight, likelihood, price)
 
     def fit(self, cam_from_body: Array, axes: Array, *, turns: bool) -> _Fit:
@@ -263,17 +266,16 @@ def _jacobian(now: Array, middle: Array, spread: float, axes: Array) -> Array:
     return jacobian
 
 
-def _likelihood(turned: Array, shifted: Array, exact: float) -> float:
+def _likelihood(turned: Array, shifted: Array) -> float:
     """The largest logarithm of the likelihood of errors [n, 3] and [n, 3], for any deviations of the two.
 
     They are taken for Student's, of one camera together: a few that are far off count for little.
     """
     squares = np.stack([(part**2).sum(1) for part in (turned, shifted)])
-    least = np.array([[EXACT], [max(exact, 1e-300)]]) ** 2
-    variance = np.maximum(np.median(squares, axis=1, keepdims=True) / 3, least)
+    variance = np.maximum(np.median(squares, axis=1, keepdims=True) / 3, EXACT**2)
     for _ in range(ROUNDS):
         weight = (FREEDOM + 6) / (FREEDOM + (squares / variance).sum(0))
-        variance = np.maximum((weight * squares).mean(1, keepdims=True) / 3, least)
+        variance = np.maximum((weight * squares).mean(1, keepdims=True) / 3, EXACT**2)
     far = np.log1p((squares / variance).sum(0) / FREEDOM).sum()
     return float(-1.5 * squares.shape[1] * np.log(variance).sum() - (FREEDOM + 6) / 2 * far)
 

@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.formats.positions.position_priors import position_priors
-from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.model.dataset import Dataset, Frame
 from biresnerf.data.seeding.map_images import MappedModel
 from biresnerf.geometry.body_offset import tie
 from biresnerf.geometry.earth.georeference import NoGeoreference, fit_positions
 from biresnerf.geometry.focus import focus_point
 from biresnerf.geometry.pose_error import rotation_between_deg
-from biresnerf.geometry.rigid import rotation_vectors
+from biresnerf.geometry.rigid import rigid_inverse, rotation_vectors
 from biresnerf.geometry.similarity import align_robust
 
 logger = logging.getLogger(__name__)
@@ -32,6 +32,10 @@ STRAY_MOST = 0.15
 JUDGED_FROM = 3  # given poses in a model; fewer tie it to their frame and say nothing of it
 OPENGL = frozenset({"nerfstudio", "instant-ngp", "blender", "bundler"})  # formats whose cameras look along -z
 AXES = ("OpenGL axes (x right, y up, z back)", "OpenCV axes (x right, y down, z forward)")
+INVERTED = (
+    "The given matrices look inverted: from the world to the camera, where those from the camera to the world are "
+    "expected. Feature matches show it, and they were inverted before anything else."
+)
 NEARLY_DEG, NEARLY = 1.0, 0.9998  # a turn that has a name: its angle, and the cosine of its axis
 
 
@@ -118,7 +122,8 @@ def in_measured_frame(matched: MatchedPoses, dataset: Dataset) -> MatchedPoses:
 def without_offset(dataset: Dataset, models: Sequence[MappedModel]) -> Dataset:
     """The set with the cameras' poses in place of those of bodies that carry them, where a model shows these.
 
-    The best model tells: its frame is found with the offset, so that the given frame stays.
+    The best model tells: its frame is found with the offset, so that the given frame stays. It tells as well
+    whether the given matrices are inverted.
     """
     given = [frame.world_from_cam for frame in dataset.frames]
     pairs = [
@@ -127,17 +132,31 @@ def without_offset(dataset: Dataset, models: Sequence[MappedModel]) -> Dataset:
         for here, row in zip(model.world_from_cam, model.rows, strict=True)
         if (there := given[row]) is not None
     ]
-    found = tie(*(np.stack(rig) for rig in zip(*pairs, strict=True))) if pairs else None
-    if found is None or found.offset is None:
+    if not pairs:
         return dataset
-    body_from_cam = found.offset.body_from_cam
-    words = offset_words(body_from_cam, dataset.source.dialect)
-    logger.info("%s", words)
-    frames = tuple(
-        f if f.world_from_cam is None else replace(f, world_from_cam=f.world_from_cam @ body_from_cam)
-        for f in dataset.frames
-    )
-    return replace(dataset, frames=frames, body_offset=found.offset, warnings=(*dataset.warnings, words))
+    fitted, there = (np.stack(rig) for rig in zip(*pairs, strict=True))
+    axes = np.diag([1.0, -1, -1, 1]) if dataset.source.dialect in OPENGL else np.eye(4)
+    found, other = tie(fitted, there), tie(fitted, axes @ rigid_inverse(there) @ axes)
+    words = []
+    if inverted := other.explains_more_than(found):
+        found = other
+        words.append(INVERTED)
+    if found.offset is not None:
+        words.append(offset_words(found.offset.body_from_cam, dataset.source.dialect))
+    if not words:
+        return dataset
+    logger.info("%s", " ".join(words))
+    body_from_cam = np.eye(4) if found.offset is None else found.offset.body_from_cam
+
+    def taken_back(frame: Frame) -> Frame:
+        if frame.world_from_cam is None:
+            return frame
+        pose = axes @ rigid_inverse(frame.world_from_cam) @ axes if inverted else frame.world_from_cam
+        raw = {key: value for key, value in frame.raw.items() if key != "transform_matrix"}
+        return replace(frame, world_from_cam=pose @ body_from_cam, raw=raw)
+
+    frames = tuple(taken_back(frame) for frame in dataset.frames)
+    return replace(dataset, frames=frames, body_offset=found.offset, warnings=(*dataset.warnings, *words))
 
 
 def offset_words(body_from_cam: NDArray[np.float64], dialect: str) -> str:

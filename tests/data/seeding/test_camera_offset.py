@@ -21,7 +21,7 @@ from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.geometry.similarity import Similarity
 from tests.data.test_real_sets import ROOT
-from tests.geometry.rigs import dome
+from tests.geometry.rigs import dome, jitter
 
 CASE = ROOT / "interop/50_camera_side_turn"
 FLIP = np.diag([1.0, -1, -1, 1])
@@ -73,6 +73,20 @@ def test_the_poses_of_the_cameras_are_written_and_not_those_that_were_read(tmp_p
     write_transforms(found, found.world_from_cam, tmp_path / "transforms.json")
     written = json.loads((tmp_path / "transforms.json").read_text())["frames"]
     np.testing.assert_allclose([row["transform_matrix"] for row in written], truth @ FLIP, atol=1e-9)
+
+
+@pytest.mark.parametrize("dialect", ["nerfstudio", "colmap"])
+def test_inverted_matrices_are_inverted_and_said(dialect):
+    rng = np.random.default_rng(1)
+    truth = jitter(dome(9, rng), rng, 0.1, 0.2)
+    axes = FLIP if dialect == "nerfstudio" else np.eye(4)
+    inverted = np.linalg.inv(truth @ axes) @ axes  # as read of a file that has the inverses
+    dataset = replace(given_set(inverted), source=SourceFormat(dialect))
+    found = without_offset(dataset, [model_of(truth, np.arange(9))])
+    np.testing.assert_allclose(found.world_from_cam, truth, atol=1e-9)
+    assert found.body_offset is None
+    (words,) = found.warnings
+    assert "look inverted" in words
 
 
 def test_poses_of_cameras_stay_as_they_are():
