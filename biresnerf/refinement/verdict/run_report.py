@@ -9,6 +9,7 @@ import torch
 
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.photo_folders import few_names
+from biresnerf.data.points.tracks import Tracks
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.field.backends import gpu_faults
 from biresnerf.refinement.finish.given_poses import accuracy_report, accuracy_warnings
@@ -86,7 +87,7 @@ def run_report(
         + turntable_warnings(scene.start)
         + accuracy_warnings(finish.given, optimiser.options)
         + unmatched_warnings(scene)
-        + one_place_warnings(scene, refined.world_from_cam)
+        + one_place_warnings(scene.tracks, refined)
         + gpu_warnings(optimiser.device)
         + smaller_batches(optimiser)
         + slower_steps(optimiser)
@@ -144,11 +145,11 @@ def unmatched_warnings(scene: Scene) -> tuple[str, ...]:
     )
 
 
-def one_place_warnings(scene: Scene, refined: np.ndarray) -> tuple[str, ...]:
-    """A warning where rotations alone explain the feature matches."""
-    if scene.tracks is None or not np.isfinite(refined).all():
+def one_place_warnings(tracks: Tracks | None, refined: RefinedPoses) -> tuple[str, ...]:
+    """A warning where rotations alone explain the feature matches, through the refined lenses."""
+    if tracks is None or not np.isfinite(refined.world_from_cam).all():
         return ()
-    share = explained_from_one_place(scene.dataset, scene.tracks, refined)
+    share = explained_from_one_place(refined.dataset, tracks, refined.world_from_cam)
     if share < ONE_PLACE:
         return ()
     return (
