@@ -167,6 +167,9 @@ def _counted(f: Findings) -> list[PairedDifference]:
 
 def _for(f: Findings) -> list[str]:
     """What speaks for the refined poses."""
+    counted = _counted(f)
+    if f.compared_with == "seeded" and len(counted) == 2 and all((item.low or 0.0) > 0 for item in counted):
+        return [VIEWS, MATCHES]  # nobody gave the others: however little, but beyond chance
     names = []
     if _views_are_better(f) and (_views_tell(f) or _matches_are_better(f)):
         names.append(VIEWS)

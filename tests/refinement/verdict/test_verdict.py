@@ -141,6 +141,19 @@ def test_photos_alone_do_not_speak_for_poses_that_miss_them_by_more_than_half_of
     assert decide(findings(held_out(-0.7, missed_px=6.0), moved_px=2.2)).verdict == "kept_input"
 
 
+def test_poses_that_nobody_gave_yield_to_ones_that_both_kinds_of_evidence_find_a_little_better():
+    """As those with a principal point that was found: all cameras turn, and each photo is fitted a little better."""
+    little = findings(held_out(0.1, spread=0.05), matched(0.06))
+    assert [item.finding for item in (little.heldout.psnr, little.epipolar.error_px)] == ["same", "same"]
+    assert (decide(little).verdict, decide(little).returned) == ("kept_input", "input")
+    seeded = decide(replace(little, compared_with="seeded"))
+    assert (seeded.verdict, seeded.returned) == ("improved", "refined")
+    for one in (held_out(0.1, spread=0.5), held_out(-0.1, spread=0.05)):
+        assert decide(findings(one, matched(0.06), compared_with="seeded")).returned == "input"
+    alone = findings(held_out(0.1, spread=0.05), compared_with="seeded")
+    assert decide(alone).returned == "input"
+
+
 def test_without_evidence_refined_poses_stand_only_against_a_guess():
     assert decide(findings(grounded=False)).returned == "refined"
     assert decide(findings(held_out(-4.0), grounded=False)).returned == "input"
