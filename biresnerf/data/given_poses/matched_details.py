@@ -90,7 +90,9 @@ def _corners(photo: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[n
     strongest = np.argsort(-inner[y, x], kind="stable")[:CORNERS]
     y, x = y[strongest], x[strongest]
     around = np.arange(1 - _REACH, _REACH, _SPACING)
-    seen = grey[y[:, None, None] + around[:, None], x[:, None, None] + around].reshape(len(y), -1)
+    seen = grey[y[:, None, None] + around[:, None], x[:, None, None] + around].reshape(
+        len(y), len(around) ** 2
+    )
     seen = seen - seen.mean(axis=1, keepdims=True)
     seen /= np.maximum(np.linalg.norm(seen, axis=1, keepdims=True), 1e-6)
     return np.stack([x + 0.5, y + 0.5], axis=1), seen
