@@ -46,7 +46,8 @@ def borne_out(dataset: Dataset, pairs: Sequence[MatchedPair]) -> PoseQuestion | 
     as_given = agreeing(())
     others = {reading: agreeing(reading) for reading in _readings(form)}
     best = max(others.values(), key=lambda found: float(found.mean()))
-    if best.mean() - as_given.mean() < MORE or _ahead(best, as_given) < CLEARLY:
+    clearly = best.mean() - as_given.mean() >= MORE and _ahead(best, as_given) >= CLEARLY
+    if not clearly:
         return None
     reading = next(one for one, found in others.items() if _ahead(best, found) <= AS_GOOD)
     shares = float(as_given.mean()), float(others[reading].mean())
