@@ -19,7 +19,7 @@ from workers.settings.settings import Settings
 
 VARIABLES = {f"BIRESNERF_{name.upper()}" for name in Settings.model_fields}
 # Read by commands, not settings of the service.
-VARIABLES |= {"BIRESNERF_URL", "BIRESNERF_API_KEY", "BIRESNERF_FIELD_DATA"}
+VARIABLES |= {"BIRESNERF_URL", "BIRESNERF_API_KEY"}
 # Other people's programs, and what every shell has.
 OTHERS = (
     "ns-train ",
