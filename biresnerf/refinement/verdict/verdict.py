@@ -100,8 +100,10 @@ def frame_doubt(turned_deg: Array, shifted: Array, spread: float) -> str:
 def decide(findings: Findings) -> Verdict:
     """The verdict by the rules of docs/verdict.md."""
     name, ground = _judge(findings)
-    # Where nothing speaks for either, poses that somebody found stay, and mere guesses do not.
-    keep = name != "improved" and not (name == "inconclusive" and not findings.grounded)
+    # Where nothing speaks for either, poses that somebody gave stay, as do found ones while the evidence is weak; mere
+    # guesses do not, nor found ones that measure the same: left-out tracks and patches chose the refined ones.
+    yields = _measures_the_same(findings) if name == "unchanged" else not findings.grounded
+    keep = name != "improved" and not (name in ("unchanged", "inconclusive") and yields)
     return Verdict(
         verdict=name,
         returned="input" if keep else "refined",
@@ -139,6 +141,11 @@ def _judge(f: Findings) -> tuple[VerdictName, str]:
         return "improved", " ".join(
             filter(None, (f"The refined poses are better by {_named(speaks_for)}.", f.out_of_frame))
         )
+    return _without_a_voice(f)
+
+
+def _without_a_voice(f: Findings) -> tuple[VerdictName, str]:
+    """Where nothing may speak, for or against."""
     if _matches_are_better(f):
         return (
             "inconclusive",
@@ -153,8 +160,17 @@ def _judge(f: Findings) -> tuple[VerdictName, str]:
         )
     findings = [item.finding for item in _counted(f)]
     if findings and all(finding == "same" for finding in findings):
+        if _measures_the_same(f):
+            return "unchanged", "No measure tells the refined poses from those that feature matches gave."
         return "kept_input", "The refined poses are no better than the input's by any measure."
     return "inconclusive", "The evidence is too weak to tell the refined poses from the input's."
+
+
+def _measures_the_same(f: Findings) -> bool:
+    """Whether poses that matches gave and refined ones differ, and neither unseen views nor other matches tell how."""
+    counted = _counted(f)
+    both = len(counted) == 2 and all(item.finding == "same" for item in counted)
+    return f.compared_with == "seeded" and f.moved_px >= MEASURABLE_PX and both
 
 
 def _counted(f: Findings) -> list[PairedDifference]:
@@ -167,9 +183,6 @@ def _counted(f: Findings) -> list[PairedDifference]:
 
 def _for(f: Findings) -> list[str]:
     """What speaks for the refined poses."""
-    counted = _counted(f)
-    if f.compared_with == "seeded" and len(counted) == 2 and all((item.low or 0.0) > 0 for item in counted):
-        return [VIEWS, MATCHES]  # nobody gave the others: however little, but beyond chance
     names = []
     if _views_are_better(f) and (_views_tell(f) or _matches_are_better(f)):
         names.append(VIEWS)
