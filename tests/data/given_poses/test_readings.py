@@ -49,9 +49,10 @@ MISTAKES: list[tuple[tuple[PoseReading, ...], object]] = [
     (("rolled_90",), lambda poses: poses @ np.array([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) @ F),
     (("rolled_180",), lambda poses: poses @ np.diag([-1.0, -1, 1, 1]) @ F),
 ]  # fmt: skip
+NAMES = [" ".join(reading) or "nothing" for reading, _ in MISTAKES]
 
 
-@pytest.mark.parametrize(("reading", "mistake"), MISTAKES, ids=lambda value: str(value)[:40])
+@pytest.mark.parametrize(("reading", "mistake"), MISTAKES, ids=NAMES)
 def test_a_wrong_transforms_json_is_read_as_it_was_meant(reading, mistake) -> None:
     applied = np.eye(4)
     applied[:3] = np.array([[0, 1, 0, 0.5], [-1, 0, 0, 0.0], [0, 0, 1, 2.0]])
