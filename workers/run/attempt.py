@@ -15,9 +15,10 @@ from typing import Any, Literal
 
 from pydantic import ValidationError
 
+from biresnerf.errors import Fault
 from biresnerf.options.refine_options import ResolvedOptions, parse_options
 from biresnerf.progress import Progress
-from biresnerf.report import Report, VerdictName
+from biresnerf.report import Verdict, VerdictName
 from biresnerf.wire.problems import JobError
 from workers.database.database import Database
 from workers.jobs.claim import Claim, Fenced
@@ -272,12 +273,13 @@ class Attempt:
         if self._claim.kind != "refine":
             return None, ()
         try:
-            report = Report.model_validate_json((self._output / "report.json").read_bytes())
+            report = json.loads((self._output / "report.json").read_bytes())
+            passed = report.get("verdict")
+            verdict = None if passed is None else Verdict.model_validate(passed).verdict
+            return verdict, tuple(Fault.model_validate(fault).code for fault in report.get("faults", ()))
         except (OSError, ValueError) as error:
             log.error("no verdict of %s: %s", self._claim.job_id, error)
             return None, ()
-        verdict = None if report.verdict is None else report.verdict.verdict
-        return verdict, tuple(fault.code for fault in report.faults)
 
     def _reported_error(self) -> JobError:
         """What the process wrote to ``error.json`` before it exited with 2 or 3."""
