@@ -7,9 +7,9 @@ from pathlib import Path
 
 from biresnerf.data.formats.match_names import match_files
 from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.model.part_of_set import with_frames
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
-from biresnerf.report import IntrinsicsSource
 from biresnerf.result import load
 
 
@@ -51,8 +51,9 @@ def joined_to(dataset: Dataset, result: Path) -> tuple[Dataset, tuple[str, ...]]
             )
         frames.append(frame)
     shared = _shared(dataset, [frame.camera for frame in frames])
-    joined = tuple(replace(frame, camera=shared.get(frame.camera, frame.camera)) for frame in frames)
-    return _with_used_cameras(replace(dataset, frames=joined), cameras, sources), tuple(found)
+    joined = [replace(frame, camera=shared.get(frame.camera, frame.camera)) for frame in frames]
+    seen_by_all = replace(dataset, cameras=tuple(cameras), intrinsics_sources=tuple(sources))
+    return with_frames(seen_by_all, joined), tuple(found)
 
 
 def _shared(dataset: Dataset, now: list[int]) -> dict[int, int]:
@@ -62,13 +63,3 @@ def _shared(dataset: Dataset, now: list[int]) -> dict[int, int]:
         if camera != frame.camera:
             known.setdefault(frame.camera, set()).add(camera)
     return {camera: min(found) for camera, found in known.items() if len(found) == 1}
-
-
-def _with_used_cameras(dataset: Dataset, cameras: list[Camera], sources: list[IntrinsicsSource]) -> Dataset:
-    used = sorted({frame.camera for frame in dataset.frames})
-    return replace(
-        dataset,
-        cameras=tuple(cameras[index] for index in used),
-        intrinsics_sources=tuple(sources[index] for index in used),
-        frames=tuple(replace(frame, camera=used.index(frame.camera)) for frame in dataset.frames),
-    )

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
-from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.model.dataset import Dataset, Frame
 from biresnerf.data.model.part_of_model import without_images
 from biresnerf.errors import InputError
 
@@ -43,17 +43,20 @@ def without_photos(dataset: Dataset, names: Sequence[str]) -> Dataset:
             where="leave_out",
             hint="Leave out fewer.",
         )
-    lenses = sorted({frame.camera for frame in kept})
-    sources = dataset.intrinsics_sources
     colmap = dataset.source.colmap
     if colmap is not None:
         colmap = without_images(colmap, {dataset.frames[row].name for row in gone})
+    return with_frames(replace(dataset, source=replace(dataset.source, colmap=colmap)), kept)
+
+
+def with_frames(dataset: Dataset, frames: Sequence[Frame]) -> Dataset:
+    """The set with these frames in the place of its own, and without lenses that none of them has."""
+    lenses = sorted({frame.camera for frame in frames})
     return replace(
         dataset,
         cameras=tuple(dataset.cameras[lens] for lens in lenses),
-        frames=tuple(replace(frame, camera=lenses.index(frame.camera)) for frame in kept),
-        source=replace(dataset.source, colmap=colmap),
-        intrinsics_sources=tuple(sources[lens] for lens in lenses) if sources else (),
+        frames=tuple(replace(frame, camera=lenses.index(frame.camera)) for frame in frames),
+        intrinsics_sources=tuple(dataset.source_of_intrinsics(lens) for lens in lenses),
     )
 
 
