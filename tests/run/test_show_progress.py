@@ -35,6 +35,7 @@ def run_of(steps: int) -> list[Progress]:
 def shown(monkeypatch: pytest.MonkeyPatch, stream: io.StringIO, steps: int) -> str:
     monkeypatch.setattr(sys, "stderr", stream)
     monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.delitem(sys.modules, "ipykernel", raising=False)  # where a notebook's tests ran before
     with ShownProgress() as show:
         for progress in run_of(steps):
             show(progress)

@@ -53,10 +53,10 @@ def directions(
             xx = radial + slope * x * x + p1 * y * 2.0 + (p2 * 6.0 + sx * 2.0) * x
             yy = radial + slope * y * y + p2 * x * 2.0 + (p1 * 6.0 + sy * 2.0) * y
             across = slope * x * y + p1 * x * 2.0 + p2 * y * 2.0
-            xy, yx = across + sx * y * 2.0, across + sy * x * 2.0
-            determinant = xx * yy - xy * yx
-            x -= (yy * error_x - xy * error_y) / determinant
-            y -= (xx * error_y - yx * error_x) / determinant
+            upper, lower = across + sx * y * 2.0, across + sy * x * 2.0
+            determinant = xx * yy - upper * lower
+            x -= (yy * error_x - upper * error_y) / determinant
+            y -= (xx * error_y - lower * error_x) / determinant
     s = x * x + y * y
     z = 1.0 / tl.sqrt(s + 1.0)
     scale = z
