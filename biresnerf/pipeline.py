@@ -12,6 +12,7 @@ import torch
 
 from biresnerf.compile_kernels import compile_kernels
 from biresnerf.data.formats.positions.known_distance import KnownDistance
+from biresnerf.data.formats.positions.position_priors import position_priors
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.given_poses.likely_reading import as_warning, pose_question
 from biresnerf.data.given_poses.readings import read_as
@@ -90,6 +91,7 @@ def refine_poses(
     dataset = input if isinstance(input, Dataset) else _read(Path(input), setup)
     dataset = without_copies(without_photos(dataset, setup.options.leave_out))
     dataset = _as_meant(dataset, setup.options)
+    dataset = replace(dataset, positions=position_priors(dataset))
     scene, origin = _seed(dataset, setup)
     stages = _first_step(scene, origin, setup, observer)
     keep_to_budget(stages, started, setup.options.steps)

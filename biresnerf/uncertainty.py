@@ -41,7 +41,7 @@ _Row4 = tuple[float, float, float, float]
 class GeoReference(FrozenModel, allow_inf_nan=False):
     """Where the returned cameras lie among measured positions: GPS, or a table beside the photos.
 
-    The poses are not changed by it: it is one more transform.
+    Positions also bear on the shape of the rig, as exact as they say or as the residuals show, but not on its frame.
     """
 
     source: str = Field(examples=["EXIF"], description="EXIF, or the file that has the positions.")
@@ -53,6 +53,7 @@ class GeoReference(FrozenModel, allow_inf_nan=False):
         "or in the frame of the positions. None where the positions do not tell it.",
     )
     why_not: str | None = Field(None, examples=["3 photos have a position, and 6 are needed"])
+    doubt: str | None = Field(None, description="Where the residuals contradict the stated accuracy.")
     epsg: int | None = Field(
         None, examples=[4979], description="Of the place below, or of the frame of the positions, if known."
     )

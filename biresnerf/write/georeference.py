@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.formats.positions.position_priors import PositionPriors, position_priors
+from biresnerf.data.formats.positions.position_priors import position_priors
 from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.model.measured_places import PositionPriors
 from biresnerf.geometry.earth.geodesy import place_of
 from biresnerf.geometry.earth.georeference import Georeference, NoGeoreference, fit_positions
 from biresnerf.uncertainty import GeoReference
@@ -66,6 +67,7 @@ def _with_fit(
         {
             **reference.model_dump(),
             "used": int(fit.used.sum()),
+            "doubt": fit.doubt or None,
             "metres_from_world": tuple(map(tuple, matrix.tolist())),
             "residual_m": float(np.median(fit.residual_m[fit.used])),
             "residuals_m": {names[row]: round(residual, 4) for row, residual in rows},

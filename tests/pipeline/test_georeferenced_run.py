@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.formats.simple.poses_json import read_poses_json
+from biresnerf.data.model.measured_places import PositionPriors
+from biresnerf.data.photos.images import load_images
 from biresnerf.data.synthetic.scene import write_synthetic_scene
 from biresnerf.errors import InputError
 from biresnerf.pipeline import refine_poses
+from biresnerf.refinement.start.refined_poses import RefinedPoses
 from biresnerf.write.output_folder import GEOREFERENCE
-from tests.refinement.tiny_scene import tiny_run
+from tests.refinement.tiny_scene import tiny_optimiser, tiny_options, tiny_run
 
 pytestmark = pytest.mark.slow
 
@@ -44,6 +48,21 @@ def test_the_frame_stays_the_users_and_the_report_says_where_on_earth_it_is(tmp_
     written = json.loads((tmp_path / "out" / GEOREFERENCE).read_text())
     assert [camera["name"] for camera in written["cameras"]] == list(names)
     assert "reading 8 photos: 100 %" in said
+
+
+def test_where_nobody_gave_poses_the_result_lies_where_it_was_measured(tmp_path):
+    path = write_synthetic_scene(tmp_path / "scene", 8, 24, seed=3)
+    given = read_dataset(path)
+    frames = tuple(replace(frame, pose_source="colmap") for frame in given.frames)
+    rows, places = np.arange(8), given.world_from_cam[:, :3, 3]
+    # A metre, the unit of the poses found, is seven parts in a thousand more than it is by the positions.
+    positions = PositionPriors("EXIF", rows, 1.007 * places, np.full((8, 3), 0.01), None, None)
+    dataset = replace(given, frames=frames, positions=positions)
+    optimiser = tiny_optimiser(dataset, load_images(dataset, 24), tiny_options())
+    found = RefinedPoses.now(dataset, optimiser).world_from_cam
+    np.testing.assert_allclose(found[:, :3, 3], 1.007 * places, atol=1e-6)
+    given = RefinedPoses.now(replace(given, positions=positions), optimiser).world_from_cam
+    np.testing.assert_allclose(given[:, :3, 3], places, atol=1e-6)
 
 
 def test_a_distance_between_unknown_photos_is_refused_before_the_run(tmp_path):

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.model.colmap_scene import ColmapModel
+from biresnerf.data.model.measured_places import PositionPriors
 from biresnerf.errors import Fault
 from biresnerf.geometry.body_offset import BodyOffset
 from biresnerf.geometry.camera.camera_models import Camera
@@ -93,6 +94,7 @@ class Dataset:
         intrinsics_sources: who found each camera's intrinsics; empty where the user gave them all.
         faults: what failed on our side, so that evidence is missing that the photos may hold.
         body_offset: what all given poses lacked, and have now; None where nothing was found.
+        positions: where the photos were taken, once that was asked; None where nothing says so.
     """
 
     root: Path
@@ -103,6 +105,7 @@ class Dataset:
     intrinsics_sources: tuple[IntrinsicsSource, ...] = ()
     faults: tuple[Fault, ...] = ()
     body_offset: BodyOffset | None = None
+    positions: PositionPriors | None = None
 
     def __post_init__(self) -> None:
         if all(by == "given" for by in self.intrinsics_sources):

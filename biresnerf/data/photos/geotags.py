@@ -1,4 +1,4 @@
-"""Where photos say that they were taken: the GPS position in EXIF."""
+"""Where photos say that they were taken: the GPS position in EXIF, and its accuracy in EXIF or a drone's XMP."""
 
 from __future__ import annotations
 
@@ -9,11 +9,20 @@ from typing import NamedTuple
 from PIL import Image
 
 from biresnerf.data.photos.image_files import from_exif, open_image, quiet_pillow
+from biresnerf.data.photos.kinds.xmp import xmp, xmp_number
 
 _GPS_IFD = 0x8825
 _LATITUDE_REF, _LATITUDE, _LONGITUDE_REF, _LONGITUDE, _ALTITUDE_REF, _ALTITUDE = range(1, 7)
 _ERROR = 0x1F
 _BELOW_SEA = (1, b"\x01")
+# Standard deviations along east, north and up, m: of DJI's RTK, and as Pix4D's names, which Parrot, MicaSense and
+# senseFly use, have them.
+_ACCURACY = (
+    ("drone-dji:RtkStdLon", "Camera:GPSXYAccuracy"),
+    ("drone-dji:RtkStdLat", "Camera:GPSXYAccuracy"),
+    ("drone-dji:RtkStdHgt", "Camera:GPSZAccuracy"),
+)
+_RTK = "drone-dji:RtkFlag"  # 0: none, 16: of one receiver, 34: float, 50: fixed
 
 
 class MeasuredPlace(NamedTuple):
@@ -21,21 +30,31 @@ class MeasuredPlace(NamedTuple):
 
     Attributes:
         place: latitude, longitude (degrees, north and east above zero) and height (m); or x, y, z (m).
-        accuracy_m: standard deviation along each axis; None where it is not said.
+        accuracy_m: standard deviations along east, north and up, or x, y and z; None where they are not said.
     """
 
     place: tuple[float, float, float]
-    accuracy_m: float | None = None
+    accuracy_m: tuple[float, float, float] | None = None
 
 
 def read_geotag(path: Path, name: str) -> MeasuredPlace | None:
-    """Latitude, longitude and altitude by EXIF, and its horizontal positioning error; None where one is missing.
+    """Latitude, longitude and altitude by EXIF, with the accuracy that the photo states; None where one is missing.
 
     Raises:
         InputError: as `open_image`.
     """
     with quiet_pillow(), open_image(path, name) as image:
-        return from_exif(image, _place)
+        place = from_exif(image, _place)
+        stated = None if place is None else _of_drone(xmp(image))
+    return place if place is None or stated is None else place._replace(accuracy_m=stated)
+
+
+def _of_drone(text: bytes) -> tuple[float, float, float] | None:
+    """The accuracy that a drone states, unless its RTK was off."""
+    east, north, up = (xmp_number(text, *names) for names in _ACCURACY)
+    if xmp_number(text, _RTK) == 0 or east is None or north is None or up is None:
+        return None
+    return (east, north, up) if all(0 < error < 1e6 for error in (east, north, up)) else None
 
 
 def _place(exif: Image.Exif) -> MeasuredPlace | None:
@@ -52,7 +71,7 @@ def _place(exif: Image.Exif) -> MeasuredPlace | None:
     if not sensible:
         return None
     error = float(tags.get(_ERROR, math.nan))
-    return MeasuredPlace((latitude, longitude, altitude), error if 0 < error < 1e6 else None)
+    return MeasuredPlace((latitude, longitude, altitude), (error,) * 3 if 0 < error < 1e6 else None)
 
 
 def _degrees(parts: tuple[float, float, float]) -> float:

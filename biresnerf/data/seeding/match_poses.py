@@ -109,7 +109,7 @@ def in_measured_frame(matched: MatchedPoses, dataset: Dataset) -> MatchedPoses:
         return matched
     priors = priors.of(matched.placed)
     try:
-        fit = fit_positions(matched.world_from_cam[priors.rows], priors.positions_m, priors.accuracy_m)
+        fit = fit_positions(matched.world_from_cam[priors.rows], priors.positions_m)
     except NoGeoreference as reason:
         logger.info("%s gives no frame: %s", priors.source, reason)
         return matched

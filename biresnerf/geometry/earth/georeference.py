@@ -30,11 +30,13 @@ class Georeference:
         metres_from_world: a point of the cameras' world in metres, along the axes of the positions.
         used: bool [m], which positions are not far beyond the others.
         residual_m: float64 [m], distance of each camera from its position.
+        doubt: a sentence where that is far more than the positions' stated accuracy, else empty.
     """
 
     metres_from_world: Similarity
     used: NDArray[np.bool_]
     residual_m: Array
+    doubt: str = ""
 
 
 class NoGeoreference(ValueError):
@@ -47,11 +49,10 @@ def fit_positions(world_from_cam: Array, positions_m: Array, accuracy_m: Array |
     Args:
         world_from_cam: the cameras.
         positions_m: in metres, in any frame.
-        accuracy_m: the stated standard deviation of each position along each axis [m], NaN where it is not known.
+        accuracy_m: stated standard deviations of the positions along the axes [m, 3], NaN where they are not known.
 
     Raises:
-        NoGeoreference: too few positions; all on a line, or scattered as far as they spread, so that a turn is open; or
-            farther from the cameras than their accuracy allows.
+        NoGeoreference: too few positions; or all on a line, or scattered as far as they spread, so that a turn is open.
     """
     if len(positions_m) < LEAST_POSITIONS:
         raise NoGeoreference(f"{len(positions_m)} photos have a position, and {LEAST_POSITIONS} are needed")
@@ -77,16 +78,18 @@ def fit_positions(world_from_cam: Array, positions_m: Array, accuracy_m: Array |
         raise NoGeoreference(
             f"positions scatter by {residual:.2g} m, and the cameras spread by {spread[1]:.2g} m across their line"
         )
-    _refuse_beyond_accuracy(residual, accuracy_m[used] if accuracy_m is not None else np.full(1, np.nan))
-    return Georeference(metres_from_world, used, apart)
+    doubt = "" if accuracy_m is None else _doubt(apart[used], accuracy_m[used])
+    return Georeference(metres_from_world, used, apart, doubt)
 
 
-def _refuse_beyond_accuracy(residual_m: float, accuracy_m: Array) -> None:
-    known = accuracy_m[np.isfinite(accuracy_m)]
-    if len(known) < 0.5 * len(accuracy_m):
-        return
-    stated = float(np.median(known))
-    if residual_m > BELIEVED * NORMAL_MEDIAN * stated:
-        raise NoGeoreference(
-            f"the cameras are {residual_m:.2g} m from their positions (median), whose stated accuracy is {stated:.2g} m"
-        )
+def _doubt(apart_m: Array, accuracy_m: Array) -> str:
+    known = np.asarray(np.isfinite(accuracy_m).all(1))
+    if 2 * known.sum() < len(known):
+        return ""
+    stated = np.sqrt((accuracy_m[known] ** 2).mean(1))
+    if not float(np.median(apart_m[known] / stated)) > BELIEVED * NORMAL_MEDIAN:
+        return ""
+    return (
+        f"The cameras are {np.median(apart_m[known]):.2g} m from their measured positions (median), whose stated "
+        f"accuracy of {np.median(stated):.2g} m is not believed."
+    )

@@ -90,6 +90,30 @@ class PatchPhotos:
 
 
 @dataclass(frozen=True, eq=False)
+class Positions:
+    """Where cameras were measured to be, in a frame of its own.
+
+    Attributes:
+        image: int64 [m].
+        metres, deviation: [m, 3], and standard deviations along the axes, m.
+        stated: whether these are known; otherwise they are one, and the residuals tell.
+    """
+
+    image: NDArray[np.int64]
+    metres: Array
+    deviation: Array
+    stated: bool
+
+    @classmethod
+    def of(cls, image: NDArray[np.int64], metres: Array, accuracy: Array) -> Positions:
+        """From accuracies [m, 3], NaN where they are not known: where most are, those positions alone are used."""
+        known = np.asarray(np.isfinite(accuracy).all(1))
+        if 2 * known.sum() < len(known):
+            return cls(image, metres, np.ones_like(metres), stated=False)
+        return cls(image[known], metres[known], accuracy[known], stated=True)
+
+
+@dataclass(frozen=True, eq=False)
 class Evidence:
     """What the poses are adjusted to.
 
@@ -99,12 +123,14 @@ class Evidence:
         tracks: None where there are none.
         patches: None where there are none.
         lenses: how the lenses differ from the intrinsics, and how well that is known; None: not at all.
+        positions: None where none are measured, or they tell nothing.
     """
 
     intrinsics: Intrinsics
     tracks: Tracks | None = None
     patches: Patches | None = None
     lenses: Lenses | None = None
+    positions: Positions | None = None
 
     def __post_init__(self) -> None:
         if bool(self.intrinsics.distortion[~self.intrinsics.fisheye].any()):

@@ -72,6 +72,7 @@ def heeded(name: CandidateName, found: Adjustment, evidence: Evidence) -> Eviden
         evidence.tracks if name != "adjusted-patches" else None,
         evidence.patches if name != "adjusted-tracks" else None,
         lenses,
+        evidence.positions,
     )
 
 

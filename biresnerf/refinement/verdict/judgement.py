@@ -15,6 +15,8 @@ from biresnerf.data.model.dataset import GUESSES, Dataset
 from biresnerf.data.workload import JUDGING
 from biresnerf.geometry.focus import focus_point, rms_spread
 from biresnerf.geometry.pose_error import rotation_between_deg
+from biresnerf.refinement.adjustment.position_term import position_misfits
+from biresnerf.refinement.finish.gather_evidence import measured_positions
 from biresnerf.refinement.lost.own_matches import contradicted
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.scene.scene import Scene
@@ -173,8 +175,18 @@ def compare_without_training(scene: Scene, refined: RefinedPoses, lost: int) -> 
         out_of_frame=frame_doubt(turned, shifted, spread) if grounded and not failed else "",
         faults=tuple(map(str, dataset.faults)),
         offset=dataset.body_offset is not None,
+        favoured_by_positions=_favoured_by_positions(dataset, before, after, placed),
     )
     return Compared(before, after, placed, turned, shifted, findings)
+
+
+def _favoured_by_positions(dataset: Dataset, before: Rig, after: Rig, placed: NDArray[np.bool_]) -> int:
+    """The poses that measured positions fit better beyond chance: 1 the refined ones, -1 the input's, 0 neither."""
+    positions = measured_positions(dataset, after.world_from_cam, placed)
+    if positions is None:
+        return 0
+    _, alike = position_misfits(np.stack([before.world_from_cam, after.world_from_cam]), positions)
+    return int(alike[1]) - int(alike[0])
 
 
 def motion(before: Array, after: Array) -> tuple[Array, Array]:

@@ -26,7 +26,7 @@ FITS_BELOW = 0.02
 EXPLAINED, UNEXPLAINED_PX = 0.1, 1.0
 MOSTLY = 0.5  # share of cameras; if more fail a check, the whole set fails it
 FAR_DEG, FAR_SHARE = 60.0, 0.5  # median residuals; beyond, the result is only roughly in the input's frame
-VIEWS, MATCHES = "unseen views", "feature matches"
+VIEWS, MATCHES, POSITIONS = "unseen views", "feature matches", "measured positions"
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,7 @@ class Findings:
         compared_with: where the input's poses come from.
         grounded: whether the input's poses are given ones or come from matches, and are not mere guesses.
         offset: whether an offset that all given poses shared was taken back.
+        favoured_by_positions: 1 where measured positions fit the refined poses better beyond chance, -1 the input's.
     """
 
     failed: tuple[str, ...]
@@ -54,6 +55,7 @@ class Findings:
     faults: tuple[str, ...] = ()
     working_share: float = 1.0
     offset: bool = False
+    favoured_by_positions: int = 0
 
     @property
     def explained(self) -> bool:
@@ -121,7 +123,7 @@ def _judge(f: Findings) -> tuple[VerdictName, str]:
     if f.moved_px < MEASURABLE_PX:
         return "unchanged", f"The poses moved by less than can be measured (below {MEASURABLE_PX:g} px)."
     speaks_for, speaks_against = _for(f), _against(f)
-    if f.out_of_frame and (speaks_against or set(speaks_for) != {VIEWS, MATCHES}):
+    if f.out_of_frame and (speaks_against or not {VIEWS, MATCHES} <= set(speaks_for)):
         return "failed_check", f.out_of_frame
     if speaks_for and speaks_against:
         return (
@@ -188,6 +190,8 @@ def _for(f: Findings) -> list[str]:
         names.append(VIEWS)
     if f.favoured_by_matches > 0:
         names.append(MATCHES)
+    if f.favoured_by_positions > 0:
+        names.append(POSITIONS)
     return names
 
 
@@ -212,6 +216,8 @@ def _against(f: Findings) -> list[str]:
         names.append(VIEWS)
     if f.favoured_by_matches < 0:
         names.append(MATCHES)
+    if f.favoured_by_positions < 0:
+        names.append(POSITIONS)
     return names
 
 

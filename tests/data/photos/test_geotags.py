@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from biresnerf.data.photos.geotags import read_geotag
-from tests.data.photos.geotagged import write_geotagged
+from tests.data.photos.geotagged import geotag, write_geotagged
 
 
 @pytest.mark.parametrize(
@@ -36,3 +36,26 @@ def test_broken_tags_spoil_nothing(tmp_path):
     exif[0x8825] = {2: (48.0, 51.0), 4: (1.0, 2.0, 0.0), 6: 7.0}
     Image.new("RGB", (16, 16)).save(tmp_path / "photo.jpg", exif=exif)
     assert read_geotag(tmp_path / "photo.jpg", "photo.jpg") is None
+
+
+# As DJI's drones write it (attributes), and Parrot's and MicaSense's (elements).
+RTK = (
+    'drone-dji:RtkFlag="{flag}" drone-dji:RtkStdLon="0.011" drone-dji:RtkStdLat="0.012"\n'
+    '   drone-dji:RtkStdHgt="0.025"'
+)
+CAMERA = "<Camera:GPSXYAccuracy>0.02</Camera:GPSXYAccuracy><Camera:GPSZAccuracy>0.05</Camera:GPSZAccuracy>"
+
+
+@pytest.mark.parametrize(
+    ("text", "accuracy"),
+    [
+        (RTK.format(flag=50), (0.011, 0.012, 0.025)),
+        (RTK.format(flag=0), None),
+        (CAMERA, (0.02, 0.02, 0.05)),
+        ('drone-dji:RtkStdLon="broken"', None),
+    ],
+)
+def test_the_accuracy_that_a_drone_states_is_read(tmp_path, text, accuracy):
+    path = tmp_path / "photo.jpg"
+    Image.new("RGB", (16, 16)).save(path, exif=geotag(48.0, 2.0, 100.0), xmp=text.encode())
+    assert read_geotag(path, path.name).accuracy_m == accuracy

@@ -32,7 +32,7 @@ def measured(poses: np.ndarray, noise_m: float) -> np.ndarray:
 @pytest.mark.parametrize("noise_m", [0.0, 0.02, 2.0])
 def test_the_similarity_is_the_true_one_as_far_as_the_positions_tell(noise_m):
     poses = cameras_m()
-    stated = np.full(COUNT, max(noise_m, 1e-3))
+    stated = np.full((COUNT, 3), max(noise_m, 1e-3))
     fit = fit_positions(WORLD_FROM_METRES.apply_to_poses(poses), measured(poses, noise_m), stated)
     back = fit.metres_from_world.apply_to_poses(WORLD_FROM_METRES.apply_to_poses(poses))
     assert np.abs(back[:, :3, 3] - poses[:, :3, 3]).max() < 1e-6 + 2 * noise_m
@@ -53,9 +53,9 @@ def test_the_residuals_are_the_distances_and_one_wrong_position_moves_nothing():
     assert np.delete(fit.residual_m, [4, 9]).max() < 0.6
 
 
-def refusal(poses: np.ndarray, positions: np.ndarray, accuracy_m: float = np.nan) -> str:
+def refusal(poses: np.ndarray, positions: np.ndarray) -> str:
     with pytest.raises(NoGeoreference) as caught:
-        fit_positions(WORLD_FROM_METRES.apply_to_poses(poses), positions, np.full(len(poses), accuracy_m))
+        fit_positions(WORLD_FROM_METRES.apply_to_poses(poses), positions)
     return str(caught.value)
 
 
@@ -68,8 +68,10 @@ def test_a_frame_that_positions_leave_open_is_refused_with_the_reason():
     assert "scatter" in refusal(poses, np.random.default_rng(8).normal(0, 50, (COUNT, 3)))
 
 
-def test_positions_farther_away_than_their_accuracy_allows_are_refused():
+def test_an_accuracy_that_the_residuals_contradict_is_doubted_and_the_frame_is_kept():
     poses = cameras_m()
-    positions = measured(poses, 2.0)
-    assert "accuracy is 0.05 m" in refusal(poses, positions, 0.05)
-    fit_positions(WORLD_FROM_METRES.apply_to_poses(poses), positions, np.full(COUNT, 1.5))
+    positions, world = measured(poses, 2.0), WORLD_FROM_METRES.apply_to_poses(poses)
+    doubted = fit_positions(world, positions, np.full((COUNT, 3), 0.05))
+    assert "accuracy of 0.05 m is not believed" in doubted.doubt
+    assert doubted.metres_from_world.scale * WORLD_FROM_METRES.scale == pytest.approx(1, abs=0.05)
+    assert not fit_positions(world, positions, np.full((COUNT, 3), 1.5)).doubt

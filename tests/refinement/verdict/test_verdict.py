@@ -84,6 +84,8 @@ def findings(
         (findings(held_out(1.0, spread=3.0)), "inconclusive", "input"),
         (findings(held_out(0.05, similarity_gain=-0.05)), "kept_input", "input"),
         (findings(held_out(4.0, similarity_gain=-0.05)), "inconclusive", "input"),
+        (findings(held_out(0.05), favoured_by_positions=1), "improved", "refined"),
+        (findings(held_out(4.0), favoured_by_positions=-1), "inconclusive", "input"),
         (findings(held_out(0.05, similarity_gain=0.05)), "kept_input", "input"),
         (findings(held_out(4.0, views=1)), "inconclusive", "input"),
         (findings(), "inconclusive", "input"),

@@ -37,6 +37,6 @@ def read_references(file: Path) -> PositionTable | None:
         where = f"{file.name} camera {label!r} reference"
         stated = reference.get("sxyz") or properties.get("accuracy_cameras")
         a, b, c, accuracy = finite_numbers([*texts, stated or "0"], where, _HINT).tolist()
-        places[label] = MeasuredPlace((a, b, c), accuracy if accuracy > 0 else None)
+        places[label] = MeasuredPlace((a, b, c), (accuracy,) * 3 if accuracy > 0 else None)
     epsg = WGS84 if degrees else int(numbers[-1]) if numbers else None
     return PositionTable(file.name, places, degrees, epsg) if places else None

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from biresnerf.data.formats.match_names import match_files
 from biresnerf.data.formats.positions.metashape_references import read_references
@@ -18,46 +16,21 @@ from biresnerf.data.formats.positions.position_table import (
     read_position_table,
 )
 from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.model.measured_places import PositionPriors
 from biresnerf.data.model.untrusted_file import read_text
 from biresnerf.data.photos.geotags import MeasuredPlace, read_geotag
 from biresnerf.errors import InputError
 from biresnerf.geometry.earth.geodesy import east_north_up
 
 
-@dataclass(frozen=True, eq=False)
-class PositionPriors:
-    """Where photos were taken, as measured.
-
-    Attributes:
-        source: what says so, for messages.
-        rows: int64 [m], the frames that have a position.
-        positions_m: float64 [m, 3]: along east, north and up from the origin, or in the source's own frame.
-        accuracy_m: float64 [m], standard deviation along each axis; NaN where it is not said.
-        origin: latitude, longitude (degrees) and height (m), the median of all; None for a frame of the source's own.
-        epsg: EPSG's number of the origin's coordinates, or of the source's frame; None where it is not known.
-    """
-
-    source: str
-    rows: NDArray[np.int64]
-    positions_m: NDArray[np.float64]
-    accuracy_m: NDArray[np.float64]
-    origin: tuple[float, float, float] | None
-    epsg: int | None
-
-    def of(self, frames: NDArray[np.bool_]) -> PositionPriors:
-        """Those of these frames [n] alone, with the same origin."""
-        kept = frames[self.rows]
-        return replace(
-            self, rows=self.rows[kept], positions_m=self.positions_m[kept], accuracy_m=self.accuracy_m[kept]
-        )
-
-
 def position_priors(dataset: Dataset) -> PositionPriors | None:
-    """The positions of the first source that has some: a table beside the photos, Metashape's references, EXIF.
+    """The positions that the set has, or of the first source that has some: a table, Metashape's references, EXIF.
 
     Raises:
         InputError: ``positions_invalid``, or a code of `open_image`.
     """
+    if dataset.positions is not None:
+        return dataset.positions
     table, _ = _of_table(dataset)
     for one in (table, _of_metashape(dataset)):
         if one is not None and (found := _by_frame(dataset, one)):
@@ -124,7 +97,7 @@ def _priors(
     source: str, found: dict[int, MeasuredPlace], epsg: int | None, *, in_degrees: bool
 ) -> PositionPriors:
     places = np.array([place.place for place in found.values()], dtype=np.float64)
-    accuracy = np.array([np.nan if p.accuracy_m is None else p.accuracy_m for p in found.values()])
+    accuracy = np.array([p.accuracy_m or (np.nan,) * 3 for p in found.values()])
     rows = np.array(list(found), dtype=np.int64)
     if not in_degrees:
         return PositionPriors(source, rows, places, accuracy, None, epsg)

@@ -31,8 +31,11 @@ _COLUMNS = {
     "y": ("y", "northing", "ynorthing", "ylatitude"),
     "z": ("z", "alt", "altitude", "height", "elevation", "zaltitude", "zheight"),
     "accuracy": ("accuracy", "accuracym", "sigma", "std", "xyzaccuracy"),
+    "zaccuracy": ("zaccuracy", "accuracyz", "verticalaccuracy", "sigmaz"),
 }
-_ODM_ACCURACY = 7  # column of geo.txt's horizontal accuracy, after name, position and angles
+_ODM_ACCURACY = (
+    7  # column of geo.txt's horizontal accuracy, after name, position and angles; the vertical one follows
+)
 
 
 @dataclass(frozen=True)
@@ -91,7 +94,7 @@ def read_position_table(file: Path) -> PositionTable:
         name = _cell(cells, header["name"])
         if not name or not any(texts):  # Metashape lists photos without a reference, too
             continue
-        accuracy = _cell(cells, header["accuracy"]) if "accuracy" in header else ""
+        accuracy = [_cell(cells, header[key]) for key in ("accuracy", "zaccuracy") if key in header]
         _add(places, name, texts, accuracy, where, degrees=degrees)
     epsg = WGS84 if degrees else int(numbers[-1]) if numbers else None
     return PositionTable(file.name, places, degrees, epsg)
@@ -117,7 +120,8 @@ def _geo_txt(source: str, lines: Sequence[str], first: int) -> PositionTable:
         where = f"{source} line {number}"
         x, y, z = cells[1:4]
         texts = [y, x, z] if degrees else [x, y, z]
-        _add(places, cells[0], texts, _cell(cells, _ODM_ACCURACY), where, degrees=degrees)
+        stated = cells[_ODM_ACCURACY : _ODM_ACCURACY + 2]
+        _add(places, cells[0], texts, stated, where, degrees=degrees)
         (a, b, c), accuracy = places[cells[0]]
         places[cells[0]] = MeasuredPlace((a * metres, b * metres, c), accuracy)
     notes: tuple[str, ...] = ()
@@ -193,25 +197,26 @@ def _add(
     places: dict[str, MeasuredPlace],
     name: str,
     texts: Sequence[str],
-    accuracy: str,
+    accuracy: Sequence[str],
     where: str,
     *,
     degrees: bool,
 ) -> None:
     try:
         a, b, c = (float(text) for text in texts)
-        deviation = float(accuracy) if accuracy else None
+        stated = [float(text) for text in accuracy if text]
     except ValueError:
         raise _invalid(where, f"has {', '.join(texts)}, which are not three numbers.") from None
     if not all(math.isfinite(value) and abs(value) < 1e9 for value in (a, b, c)):
         raise _invalid(where, "has numbers that are no position.")
     if degrees and not (abs(a) <= 90 and abs(b) <= 180):
         raise _invalid(where, f"has latitude {a:g} and longitude {b:g}.")
-    if deviation is not None and not 0 < deviation < 1e6:
-        raise _invalid(where, f"has the accuracy {deviation:g} m.")
+    for deviation in stated:
+        if not 0 < deviation < 1e6:
+            raise _invalid(where, f"has the accuracy {deviation:g} m.")
     if name in places:
         raise _invalid(where, f"names {name[:100]!r} again.")
-    places[name] = MeasuredPlace((a, b, c), deviation)
+    places[name] = MeasuredPlace((a, b, c), (stated[0], stated[0], stated[-1]) if stated else None)
 
 
 def _invalid(where: str, detail: str) -> InputError:

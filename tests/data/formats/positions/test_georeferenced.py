@@ -126,7 +126,7 @@ def test_metashapes_references_are_used_with_their_accuracy_and_its_poses_stay(t
     assert dataset.source.dialect == "metashape"
     np.testing.assert_allclose(dataset.world_from_cam, world(), atol=1e-9)
     priors = position_priors(dataset)
-    assert priors.accuracy_m.tolist() == [10.0, *[0.5] * (COUNT - 1)]
+    assert priors.accuracy_m[:, 0].tolist() == [10.0, *[0.5] * (COUNT - 1)]
     found = write_georeference(dataset, dataset.world_from_cam, tmp_path)
     assert (found.source, found.epsg) == ("cameras.xml", 4979)
     assert found.residual_m < 1e-2

@@ -36,13 +36,19 @@ ODM = "EPSG:4326\na.jpg 14.25 50.5 300 1 2 3 0.05 0.1\nb.jpg 14.26 50.6 301\n"
             DEGREES,
             True,
             4979,
-            {"a.jpg": (50.5, 14.25, 300, 0.02), "b.jpg": (50.6, 14.26, 301, None)},
+            {"a.jpg": (50.5, 14.25, 300, (0.02,) * 3), "b.jpg": (50.6, 14.26, 301, None)},
         ),
         ("GPS.CSV", "Image;X;Y;Z\nA b.png;1;2;3.5\n", False, None, {"A b.png": (1, 2, 3.5, None)}),
         ("positions.csv", "x\ty\tz\tname\n1\t2\t3\t'q'\n", False, None, {"'q'": (1, 2, 3, None)}),
         ("reference.txt", METASHAPE, False, 32633, {"a": (458000.5, 5550000.25, 300, None)}),
-        ("reference.csv", METASHAPE_DEGREES, True, 4979, {"a": (50.5, 14.25, 300, 0.03)}),
-        ("geo.txt", ODM, True, 4979, {"a.jpg": (50.5, 14.25, 300, 0.05), "b.jpg": (50.6, 14.26, 301, None)}),
+        ("reference.csv", METASHAPE_DEGREES, True, 4979, {"a": (50.5, 14.25, 300, (0.03,) * 3)}),
+        (
+            "geo.txt",
+            ODM,
+            True,
+            4979,
+            {"a.jpg": (50.5, 14.25, 300, (0.05, 0.05, 0.1)), "b.jpg": (50.6, 14.26, 301, None)},
+        ),
         (
             "geo.txt",
             "EPSG:32633\na.jpg 458000 5550000 300\n",
@@ -113,7 +119,7 @@ def test_every_form_of_opendronemaps_frame_is_read(tmp_path: Path, header, row, 
     table = read_position_table(tmp_path / "geo.txt")
     assert (table.in_degrees, table.epsg) == (degrees, epsg)
     assert table.places["a.jpg"].place == pytest.approx(place, rel=1e-12)
-    assert [one.accuracy_m for one in table.places.values()] == [0.05, None]
+    assert [one.accuracy_m for one in table.places.values()] == [(0.05, 0.05, 0.1), None]
 
 
 def test_positions_without_height_are_not_used_and_the_line_is_named(tmp_path: Path):
