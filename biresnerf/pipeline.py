@@ -18,6 +18,7 @@ from biresnerf.data.given_poses.likely_reading import as_warning, pose_question
 from biresnerf.data.given_poses.readings import read_as
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.part_of_set import without_copies, without_photos
+from biresnerf.data.photos.guessed_lens import with_shared_predictions
 from biresnerf.data.photos.images import load_images
 from biresnerf.data.photos.video.video_frames import VideoReading
 from biresnerf.data.points.tracks import Tracks
@@ -89,7 +90,7 @@ def refine_poses(
     )
 
     dataset = input if isinstance(input, Dataset) else _read(Path(input), setup)
-    dataset = without_copies(without_photos(dataset, setup.options.leave_out))
+    dataset = with_shared_predictions(without_copies(without_photos(dataset, setup.options.leave_out)))
     dataset = _as_meant(dataset, setup.options)
     dataset = replace(dataset, positions=position_priors(dataset))
     scene, origin = _seed(dataset, setup)

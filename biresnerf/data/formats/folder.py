@@ -120,7 +120,7 @@ def look_at(file: Path, within: Path | None = None) -> FolderContents:
         codec = item[1]
         place = codec.place_of(file)
         if place is None or not codec.recognises(place):
-            return 3
+            return 3 + (file.name not in codec.format.found_as)
         if file.name in codec.format.found_as or place != file:
             return 0
         return 2 if codec.loose or codec.recognises is Path.is_file else 1

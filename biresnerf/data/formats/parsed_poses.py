@@ -41,6 +41,7 @@ class PoseEntry:
         where: the file, and the place in it, for messages.
         lens: its intrinsics, for the size that the file means, which may differ from the image's; None if unknown.
         size: width and height that the file declares where ``lens`` depends on the image; None where it does not.
+        upright: whether the pose is of the photo as EXIF turns it, whatever ``size`` says.
         timestamp_s: when it was taken, where the file gives that.
         camera_id: the file's own number of the camera: cameras of different numbers stay apart even if equal.
         raw: the entry as a transforms.json has it.
@@ -53,6 +54,7 @@ class PoseEntry:
     where: str
     lens: Camera | LensOf | None = None
     size: tuple[float | None, float | None] = (None, None)
+    upright: bool = False
     timestamp_s: float | None = None
     camera_id: int | None = None
     raw: dict[str, Any] = field(default_factory=dict)

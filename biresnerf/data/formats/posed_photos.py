@@ -53,7 +53,11 @@ def read_photos(images: Sequence[tuple[Path, PoseEntry]], *, strict: bool) -> Po
     read = [attempt(partial(read_header, path, entry.name)) for path, entry in images]
     stored, kept, dropped = good_frames(read, names, strict=strict)
     images = [images[index] for index in kept]
-    turns = meant_orientations(stored, [_declared_size(entry) for _, entry in images])
+    shown = meant_orientations(stored, [_declared_size(entry) for _, entry in images])
+    turns = [
+        header.orientation if entry.upright else turn
+        for (_, entry), header, turn in zip(images, stored, shown, strict=True)
+    ]
     headers = [turned_header(header, turn) for header, turn in zip(stored, turns, strict=True)]
     lenses = [
         attempt(partial(_sound_camera, entry, header))

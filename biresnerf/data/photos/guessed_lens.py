@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
+from dataclasses import replace
 
-from biresnerf.data.model.dataset import IntrinsicsSource
-from biresnerf.data.photos.image_files import ImageHeader
+import numpy as np
+
+from biresnerf.data.model.dataset import Dataset, IntrinsicsSource
+from biresnerf.data.model.part_of_set import with_frames
+from biresnerf.data.photos.image_files import ImageHeader, read_header
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera, FullParameters
 
@@ -15,6 +20,7 @@ PLAUSIBLE = (0.25, 20.0)  # of the long side, the focal length: angles of view o
 # EXIF's two ways of telling the focal length; the sensor's is the finer one, and more often wrong.
 AGREE = 0.1
 CONTRADICTS = 1.5  # by this factor EXIF's focal length and a given one differ, and not for a crop or a zoom
+MOST_APART = 0.4  # logarithms of focal lengths that were guessed of one lens
 MOST_VIEW_DEG = 150.0  # lenses that keep straight lines straight see 130 degrees or so
 LEAST_MM = 2.0  # lenses of phones have that much; shares of the width are smaller
 LEAST_SIDE = 16  # px; in smaller photos the first pixel is no corner
@@ -30,9 +36,36 @@ def guess_lens(header: ImageHeader) -> tuple[Camera, IntrinsicsSource]:
 
 
 def guess_note(source: IntrinsicsSource) -> str:
-    """A note for the user on a lens that `guess_lens` found."""
-    found = "taken from EXIF" if source == "exif" else "a guess"
+    """A note for the user on a lens that is not given."""
+    found = {"exif": "taken from EXIF", "predicted": "what a network predicted"}.get(source, "a guess")
     return f"no intrinsics are given: the focal length is {found}"
+
+
+def with_shared_predictions(dataset: Dataset) -> Dataset:
+    """The set with one SIMPLE_RADIAL camera for photos of a size and EXIF's focal length, of those predicted.
+
+    It has their medians. Predictions that differ as much as guesses do are of lenses that differ.
+    """
+    alike: dict[tuple[int, int, float | None], list[int]] = defaultdict(list)
+    for row, frame in enumerate(dataset.frames):
+        if dataset.source_of_intrinsics(frame.camera) == "predicted":
+            header = read_header(frame.path, frame.name)
+            camera = dataset.camera_of(row)
+            alike[camera.width, camera.height, exif_focal_px(header)].append(row)
+    cameras, sources = list(dataset.cameras), list(dataset.intrinsics_sources)
+    frames = list(dataset.frames)
+    for (width, height, _), rows in alike.items():
+        full = [dataset.camera_of(row).full() for row in rows]
+        focal = np.array([math.sqrt(lens.fx * lens.fy) for lens in full])
+        if np.abs(np.log(focal / np.median(focal))).max() > MOST_APART:
+            continue
+        cx, cy = np.median([(lens.cx, lens.cy) for lens in full], axis=0).tolist()
+        cameras.append(Camera("SIMPLE_RADIAL", width, height, (float(np.median(focal)), cx, cy, 0.0)))
+        sources.append("predicted")
+        for row in rows:
+            frames[row] = replace(frames[row], camera=len(cameras) - 1)
+    shared = replace(dataset, cameras=tuple(cameras), intrinsics_sources=tuple(sources))
+    return with_frames(shared, frames) if len(cameras) > len(dataset.cameras) else dataset
 
 
 def refuse_other_units(camera: Camera, where: str) -> None:

@@ -107,8 +107,7 @@ def orientation_notes(
     notes = []
     if done:
         notes.append(
-            f"{few_names(done)}: turned as EXIF says, as w and h are those of the turned pictures; poses and "
-            "intrinsics are for them as turned"
+            f"{few_names(done)}: turned as EXIF says; poses and intrinsics are for the photos as turned"
         )
     if left:
         notes.append(

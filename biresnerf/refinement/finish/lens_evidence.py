@@ -32,8 +32,11 @@ Array = NDArray[np.float64]
 
 # Standard deviation of a focal length, as a share of it, by who found it. Guesses: over 13 sets of photos of all kinds,
 # the logarithm of the focal length over the guess (1.2 of the long side) has 0.4. What COLMAP found says nothing
-# before: it is of the same matches. EXIF: whole millimetres of 35 mm film, and what stabilisation cuts off.
-FOCAL_DEVIATION: dict[IntrinsicsSource, float] = {"given": 0.02, "exif": 0.05, "colmap": 0.4, "guessed": 0.4}
+# before: it is of the same matches; what a network predicts counts as a guess. EXIF: whole millimetres of 35 mm film,
+# and what stabilisation cuts off.
+FOCAL_DEVIATION: dict[IntrinsicsSource, float] = {
+    "given": 0.02, "exif": 0.05, "predicted": 0.4, "colmap": 0.4, "guessed": 0.4
+}  # fmt: skip
 # Of distortion, as it moves the image's corner, as a share of its distance.
 RADIAL_DEVIATION, TANGENTIAL_DEVIATION = 0.1, 0.01
 # Of the principal point, as a share of the long side: six calibrated sets of photos have 0.3 to 3 %, in the root mean

@@ -59,7 +59,7 @@ def lenses_of(
 def refined_part(option: RefineIntrinsics, source: IntrinsicsSource) -> RefinedPart:
     """What is refined of a camera: as requested, or for `auto` the focal length if it was never measured."""
     if option == "auto":
-        return "focal" if source in ("exif", "guessed") else "none"
+        return "focal" if source in ("exif", "predicted", "guessed") else "none"
     return option
 
 

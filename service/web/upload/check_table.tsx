@@ -15,6 +15,7 @@ const MARKS: Record<Mark, [string, string]> = {
 const INTRINSICS: Record<string, string> = {
   given: "given",
   exif: "from EXIF",
+  predicted: "predicted by a network, and refined with the poses",
   colmap: "from COLMAP",
   guessed: "guessed, and refined with the poses",
 };

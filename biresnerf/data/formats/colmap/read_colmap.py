@@ -6,12 +6,14 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from biresnerf.data.formats.bind_images import by_name, dataset_of
 from biresnerf.data.formats.colmap.read_model import image_count, read_colmap_model
 from biresnerf.data.formats.match_names import match_files
 from biresnerf.data.formats.parsed_poses import ParsedPoses, PoseEntry
 from biresnerf.data.model.colmap_scene import ColmapModel
-from biresnerf.data.model.dataset import Dataset, SourceFormat
+from biresnerf.data.model.dataset import Dataset, IntrinsicsSource, SourceFormat
 from biresnerf.data.model.part_of_model import without_images
 from biresnerf.data.photos.image_files import read_header
 from biresnerf.data.photos.orientation import same_shape
@@ -79,7 +81,21 @@ def bind_colmap(parsed: ParsedPoses, root: Path, within: Path | None = None) -> 
     dataset = dataset_of(root, images, parsed.source, [*parsed.notes, *notes], within, strict=parsed.strict)
     model = without_images(model, {entry.name for _, entry in images} - set(dataset.names))
     fitted = _for_these_images(model, dataset, _images_table(model))
-    return replace(dataset, source=replace(parsed.source, colmap=fitted))
+    dataset = replace(dataset, source=replace(parsed.source, colmap=fitted))
+    if not _is_prediction(model):
+        return dataset
+    note = (
+        "each point of the model is seen by one photo, as VGGT and Depth Anything 3 write them: its lenses are taken "
+        "for what a network predicted"
+    )
+    found = [dataset.source_of_intrinsics(camera) for camera in range(len(dataset.cameras))]
+    sources: list[IntrinsicsSource] = ["predicted" if by == "given" else by for by in found]
+    return replace(dataset, intrinsics_sources=tuple(sources), warnings=(*dataset.warnings, note))
+
+
+def _is_prediction(model: ColmapModel) -> bool:
+    """Whether its points are pixels of depth maps: no matches, and so no lenses, were adjusted to each other."""
+    return len(model.points) > 0 and bool((np.diff(model.points.track_starts) == 1).all())
 
 
 def _images_table(model: ColmapModel) -> str:

@@ -8,7 +8,6 @@ cameras.npz is the same.
 
 from __future__ import annotations
 
-import io
 import re
 import zipfile
 from collections.abc import Sequence
@@ -25,10 +24,11 @@ from biresnerf.data.formats.parsed_poses import Assignment, ParsedPoses
 from biresnerf.data.formats.pose_rows import Placed, Row, at_size_of, parsed_rows, pinhole_of
 from biresnerf.data.formats.simple.bundler import refuse_lenses
 from biresnerf.data.formats.simple.llff import rows_by_name
+from biresnerf.data.model.array_file import npz_numbers
 from biresnerf.data.model.atomic_file import whole_file
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.refined_set import RefinedSet
-from biresnerf.data.model.untrusted_file import invalid_file, read_bytes
+from biresnerf.data.model.untrusted_file import invalid_file
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.focus import focus_point
@@ -51,11 +51,10 @@ NEUS = Format(
 )
 _HELD = 0.98  # of the points that the sphere must hold
 _HALF_PX = 0.5
-_WORLD = re.compile(r"world_mat_(\d{1,6})\.npy")
+_WORLD = re.compile(r"world_mat_\d{1,6}")
 
 
 _HINT = "Give the cameras_sphere.npz that was made for these images."
-_MAX_BYTES = 64 * 2**20
 _MAX_MATRIX_BYTES = 1024  # a 4 x 4 of float64 takes 256
 
 
@@ -95,24 +94,11 @@ def parse_neus(_root: Path, file: Path) -> ParsedPoses:
 
 
 def _world_matrices(file: Path) -> dict[int, NDArray[np.float64]]:
-    """The ``world_mat_i`` by number. Raises InputError ``pose_file_invalid``; no array is unpacked beyond 1 kB."""
-    found = {}
-    try:
-        with zipfile.ZipFile(io.BytesIO(read_bytes(file, _MAX_BYTES))) as archive:
-            for entry in archive.infolist():
-                match = _WORLD.fullmatch(entry.filename)
-                if match is None:
-                    continue
-                if entry.file_size > _MAX_MATRIX_BYTES:
-                    raise ValueError(f"{entry.filename} is too long")
-                with archive.open(entry) as opened:
-                    data = np.lib.format.read_array(io.BytesIO(opened.read()), allow_pickle=False)
-                found[int(match[1])] = np.array(data, dtype=np.float64)
-    except (zipfile.BadZipFile, ValueError, OSError, NotImplementedError, RuntimeError, EOFError) as error:
-        raise invalid_file(file.name, f"cannot be read: {error}.", _HINT) from None
+    """The ``world_mat_i`` by number. Raises InputError ``pose_file_invalid``."""
+    found = npz_numbers(file, lambda name: bool(_WORLD.fullmatch(name)), _MAX_MATRIX_BYTES, _HINT)
     if not found:
         raise invalid_file(file.name, "holds no world_mat_0.", _HINT)
-    return found
+    return {int(name.removeprefix("world_mat_")): matrix for name, matrix in found.items()}
 
 
 def _decomposed(matrix: NDArray[np.float64], where: str) -> Placed:
@@ -138,7 +124,7 @@ def _recognises(file: Path) -> bool:
     if not zipfile.is_zipfile(file):
         return False
     with zipfile.ZipFile(file) as archive:
-        return any(_WORLD.fullmatch(name) for name in archive.namelist())
+        return any(_WORLD.fullmatch(name.removesuffix(".npy")) for name in archive.namelist())
 
 
 def write_neus(refined: RefinedSet, path: Path) -> None:

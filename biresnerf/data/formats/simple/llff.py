@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import re
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +13,7 @@ from biresnerf.data.formats.codec import Codec, WriteContext
 from biresnerf.data.formats.parsed_poses import ParsedPoses
 from biresnerf.data.formats.pose_rows import Placed, entry_of
 from biresnerf.data.formats.simple.bundler import bundler_problem, refuse_lenses
+from biresnerf.data.model.array_file import HEAD_BYTES, npy_numbers
 from biresnerf.data.model.atomic_file import whole_file
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
@@ -43,11 +42,8 @@ LLFF = Format(
 # LLFF's own shares of the points in front of a camera that may lie before and behind its bounds, percent.
 _NEAREST, _FARTHEST = 0.1, 99.9
 MAX_IMAGES = 100_000
-_MAX_HEADER_BYTES = 4096
 _COLUMNS = 17
-_HEADER = re.compile(
-    rb"\{'descr': '(<f[48])', 'fortran_order': (True|False), 'shape': \(([0-9]{1,9}), 17\),? ?\}[ \n]*"
-)
+_HINT = "Write it again with numpy.save, 17 numbers a row."
 
 
 def parse_llff(_root: Path, file: Path) -> ParsedPoses:
@@ -75,8 +71,7 @@ def parse_llff(_root: Path, file: Path) -> ParsedPoses:
 
 def _read_row(row: NDArray[np.float64], where: str) -> Placed:
     if not np.isfinite(row).all():
-        hint = "Write it again with numpy.save, 17 numbers a row."
-        raise InputError("pose_not_finite", "NaN or an infinite number.", where=where, hint=hint)
+        raise InputError("pose_not_finite", "NaN or an infinite number.", where=where, hint=_HINT)
     down, right, back, centre, (height, width, focal) = row[:15].reshape(3, 5).T
     pose, _ = rigid_matrix(np.stack([right, down, -back, centre], axis=1).tolist(), where)
     return pose, _camera(height, width, focal, where)
@@ -95,29 +90,12 @@ def _camera(height: float, width: float, focal: float, where: str) -> Camera:
 
 
 def _rows(file: Path) -> NDArray[np.float64]:
-    """The rows, float64 [n, 17].
-
-    The npy header is matched and not evaluated as the Python literal that it is: on hostile headers numpy.load raises
-    more than ValueError (TokenError, RecursionError, MemoryError), and it allocates before it reads.
-    """
-
-    def invalid(what: str) -> InputError:
-        return invalid_file(file.name, what, "Write it again with numpy.save, 17 numbers a row.")
-
-    content = read_bytes(file, _MAX_HEADER_BYTES + MAX_IMAGES * _COLUMNS * 8)
-    start = {1: 10, 2: 12}.get(content[6] if len(content) > 12 else 0, 0)
-    if not content.startswith(b"\x93NUMPY") or not start:
-        raise invalid("is no npy file.")
-    length = int.from_bytes(content[8:start], "little")
-    match = _HEADER.fullmatch(content[start : start + min(length, _MAX_HEADER_BYTES)])
-    if match is None:
-        raise invalid(f"holds something other than rows of {_COLUMNS} floating-point numbers.")
-    dtype, by_columns, count = np.dtype(match[1].decode()), match[2] == b"True", int(match[3])
-    numbers = content[start + length :]
-    if count > MAX_IMAGES or len(numbers) != count * _COLUMNS * dtype.itemsize:
-        raise invalid(f"has {count} rows by its header, but its content is shorter or longer.")
-    order: Literal["F", "C"] = "F" if by_columns else "C"
-    return np.frombuffer(numbers, dtype).reshape((count, _COLUMNS), order=order).astype(np.float64)
+    """The rows, float64 [n, 17]. Raises InputError ``pose_file_invalid``."""
+    content = read_bytes(file, HEAD_BYTES + MAX_IMAGES * _COLUMNS * 8)
+    rows = npy_numbers(content, file.name, _HINT)
+    if rows.ndim != 2 or rows.shape[1] != _COLUMNS or len(rows) > MAX_IMAGES:
+        raise invalid_file(file.name, f"holds something other than rows of {_COLUMNS} numbers.", _HINT)
+    return rows
 
 
 def llff_problem(camera: Camera) -> str | None:

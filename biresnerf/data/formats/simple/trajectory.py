@@ -73,6 +73,7 @@ KITTI = Format(
 
 _PHOTO_FOLDERS = ("image_2", "image_0", "image_3", "image_1")  # KITTI's: the colour cameras first
 _LEAST_CLOCK = 1e8  # s; smaller whole numbers in names count photos, as a rule
+_FRAME_RATE = 30  # at which MASt3R-SLAM takes photos of a folder; it writes poses of some
 _HEAD = "# timestamp tx ty tz qx qy qz qw: camera to world, OpenCV axes (x right, y down, z forward), the input's frame"
 
 
@@ -82,7 +83,8 @@ def parse_trajectory(root: Path, file: Path) -> ParsedPoses:
     Which pose belongs to which image is decided by the first of these that applies: names in the file's own comments
     (TUM) or in the list beside it that `write_kitti` writes;
     rgb.txt (times and names, as in TUM's sets) or images named by their time, nearest within 0.02 s; times that are the
-    images' numbers from 0; as many poses as images, in order. The camera is that of `read_camera_file`, else a guess.
+    images' numbers from 0, or that divided by 30 (MASt3R-SLAM); as many poses as images, in order. The camera is that
+    of `read_camera_file`, else a guess.
     KITTI's poses are those of camera 0; its calib.txt says how the camera of image_2/ is mounted beside it.
 
     Raises:
@@ -154,6 +156,11 @@ def matched(trajectory: Trajectory, names: Sequence[str], root: Path) -> tuple[d
         if numbers:
             by_number = {names[int(time)]: i for i, time in enumerate(times)}
             return by_number, "by number, in the order of the images' names"
+        frames = [round(time * _FRAME_RATE) for time in times]
+        off = np.abs(np.array(times) * _FRAME_RATE - frames).max()
+        if count < len(names) and off < 1e-3 and set(frames) <= set(range(len(names))):
+            by_frame = {names[frame]: i for i, frame in enumerate(frames)}
+            return by_frame, f"by number, {_FRAME_RATE} images a second, in the order of the images' names"
     if count == len(names):
         ordered, note = names_of_poses(names, trajectory.poses)
         how = "in the order of the images' names" + (note and f"; {note}")

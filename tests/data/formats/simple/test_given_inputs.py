@@ -105,6 +105,18 @@ def test_numbers_that_count_photos_are_no_times(tmp_path):
     assert "in the order of the images' names" in dataset.warnings[0]
 
 
+def test_keyframes_of_mast3r_slam_find_their_photos_by_number_at_its_rate(tmp_path):
+    frames = [0, 7, 19, 30]
+    trajectories.tum_set(tmp_path, [str(np.float32(frame / 30)) for frame in frames], ())
+    for frame in range(31):
+        write_image(tmp_path / f"images/frame_{frame + 1}.png", frame)
+    dataset = read_dataset(tmp_path / "trajectory.txt")
+    posed = {frame.name: frame.world_from_cam for frame in dataset.frames if frame.world_from_cam is not None}
+    assert list(posed) == [f"frame_{frame + 1}.png" for frame in frames]
+    np.testing.assert_allclose(list(posed.values()), truth(), atol=1e-12)
+    assert "30 images a second" in dataset.warnings[0]
+
+
 def test_a_trajectorys_own_comments_and_rgb_txt_go_before_the_order(tmp_path):
     names = tuple(reversed(NAMES))
     head = "".join(f"# {time} {name}\n" for time, name in zip(TIMES, names, strict=True))

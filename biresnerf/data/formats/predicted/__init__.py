@@ -1,0 +1,1 @@
+"""Poses and lenses that networks predict in one go, for photos that they have scaled and cropped."""
