@@ -90,7 +90,8 @@ def refine_poses(
     )
 
     dataset = input if isinstance(input, Dataset) else _read(Path(input), setup)
-    dataset = with_shared_predictions(without_copies(without_photos(dataset, setup.options.leave_out)))
+    dataset = without_copies(without_photos(dataset, setup.options.leave_out), setup.options.fixed)
+    dataset = with_shared_predictions(dataset)
     dataset = _as_meant(dataset, setup.options)
     dataset = replace(dataset, positions=position_priors(dataset))
     scene, origin = _seed(dataset, setup)

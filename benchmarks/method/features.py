@@ -1,15 +1,17 @@
-"""Which features place cameras best: ``python -m benchmarks.method.features SET... [--size 200] [--every 2]``.
+"""Which features place cameras best: ``python -m benchmarks.method.features SET... [--size 200] [--widest 1600,3200]``.
 
 Each SET holds true poses, which get BARF's noise (0.15). Features are found with and without affine shapes and pooled
-scales, up to several numbers, and so many of each photo's pairs are matched, the likeliest. Prints a JSON line for
-each: the seconds of seeding, how many cameras COLMAP placed and their errors, and those of all cameras adjusted to the
-tracks from the truth: rotation (deg) and centre (% of the cameras' distance) after alignment.
+scales, in photos shrunk to several sizes, up to several numbers, and so many of each photo's pairs are matched, the
+likeliest. Prints a JSON line for each: the seconds of seeding and the highest memory of any COLMAP so far (MiB), how
+many cameras COLMAP placed and their errors, and those of all cameras adjusted to the tracks from the truth: rotation
+(deg) and centre (% of the cameras' distance) after alignment.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import resource
 import tempfile
 import time
 from dataclasses import replace
@@ -70,6 +72,7 @@ def measured(truth: Dataset, features: dict[str, object], noise: float, seed: in
     began = time.monotonic()
     seeding, tracks = seeded(given, features, seed)
     line: dict[str, object] = {**features, "seconds": round(time.monotonic() - began)}
+    line["memory_mib"] = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss // 1024
     matched = next((c for c in seeding.candidates if c.matched.any()), None)
     if matched is not None:
         placed = matched.matched
@@ -89,6 +92,8 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=1)
     parser.add_argument("--noise", type=float, default=0.15)
     parser.add_argument("--numbers", default="2048,4096", help="Features of a photo, at most.")
+    parser.add_argument("--widest", default="", help="Long sides at which features are looked for, px.")
+    parser.add_argument("--ways", default="thorough,plain", help="Of these, those that are tried.")
     parser.add_argument("--likeliest", default=f"{LIKELIEST}", help="Pairs that each photo chooses; 0: all.")
     parser.add_argument("--seed", type=int, default=1)
     asked = parser.parse_args()
@@ -99,15 +104,21 @@ def main() -> None:
         with tempfile.TemporaryDirectory(prefix="biresnerf-benchmark-") as folder:
             if asked.size:
                 truth = shrunk(truth, asked.size, Path(folder))
-            for number in map(int, asked.numbers.split(",")):
-                for thorough, likeliest in product((True, False), map(int, asked.likeliest.split(","))):
-                    features = {
-                        "thorough": thorough,
-                        "most_features": number,
-                        "likeliest": likeliest or None,
-                    }
-                    line = measured(truth, features, asked.noise, asked.seed)
-                    print(json.dumps({"set": path.name, **line}), flush=True)
+            tried = product(
+                asked.widest.split(","),
+                asked.numbers.split(","),
+                asked.ways.split(","),
+                asked.likeliest.split(","),
+            )
+            for widest, number, way, likeliest in tried:
+                features = {
+                    "thorough": way == "thorough",
+                    "most_features": int(number),
+                    "likeliest": int(likeliest) or None,
+                    **({"widest_image": int(widest)} if widest else {}),
+                }
+                line = measured(truth, features, asked.noise, asked.seed)
+                print(json.dumps({"set": path.name, **line}), flush=True)
 
 
 if __name__ == "__main__":

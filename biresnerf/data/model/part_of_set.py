@@ -60,21 +60,21 @@ def with_frames(dataset: Dataset, frames: Sequence[Frame]) -> Dataset:
     )
 
 
-def without_copies(dataset: Dataset) -> Dataset:
+def without_copies(dataset: Dataset, keep: Sequence[str] = ()) -> Dataset:
     """The set without photos whose files equal an earlier one's, and a note that names them.
 
     A copy's matches with its original fit exactly, and say nothing of where anything is. Copies stay where without them
-    too few photos would be left.
+    too few photos would be left, and photos of the names ``keep`` in any case.
     """
-    size = [frame.path.stat().st_size for frame in dataset.frames]
-    several = Counter(size)
+    size = {frame.name: frame.path.stat().st_size for frame in dataset.frames}
+    several = Counter(size.values())
     first: dict[bytes, str] = {}
     copies: dict[str, str] = {}
-    for frame, bytes_ in zip(dataset.frames, size, strict=True):
-        if several[bytes_] > 1:
+    for frame in sorted(dataset.frames, key=lambda frame: frame.name not in keep):
+        if several[size[frame.name]] > 1:
             with frame.path.open("rb") as file:
                 original = first.setdefault(hashlib.file_digest(file, "sha256").digest(), frame.name)
-            if original != frame.name:
+            if original != frame.name and frame.name not in keep:
                 copies[frame.name] = original
     if not copies or len(dataset) - len(copies) < LEAST:
         return dataset

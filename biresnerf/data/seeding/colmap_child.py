@@ -16,6 +16,7 @@ from typing import Any
 
 from biresnerf.data.seeding.colmap_pairs import (
     drop_contradicting_pairs,
+    leave_out_still,
     match_features,
     matched_pairs,
     write_position_priors,
@@ -61,6 +62,8 @@ def map_images(request: dict[str, Any]) -> dict[str, Any]:
     numbers = extract_features(request, database, images, extraction_options(request))
     say(f"features of {count} images found")
     match_features(request, database, work)
+    if still := leave_out_still(request, database):
+        say("two motions in many pairs: matches that stay where they are are left out")
     (work / MATCHED).touch()
     tracks = write_tracks(database, work)
     if request["cam_from_world"]:
@@ -89,7 +92,7 @@ def map_images(request: dict[str, Any]) -> dict[str, Any]:
             break
         if mapper == "incremental" and placed >= INTRINSICS_FROM * count:
             keep_intrinsics(database, best, request, numbers)
-    return {"models": answer, "matches": matches}
+    return {"models": answer, "matches": matches, "still": still}
 
 
 def extraction_options(request: dict[str, Any]) -> Any:

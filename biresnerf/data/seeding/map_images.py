@@ -86,10 +86,17 @@ class MappedModel:
 
 @dataclass(frozen=True, eq=False)
 class Mapping:
-    """The models found, and how many features [n, n] any two images have in common."""
+    """What COLMAP made of a set.
+
+    Attributes:
+        models: the best first.
+        matches: how many features [n, n] any two images have in common.
+        still: whether matches were left out that stay where they are while others move.
+    """
 
     models: tuple[MappedModel, ...]
     matches: NDArray[np.int64]
+    still: bool
 
 
 def known_intrinsics(dataset: Dataset) -> list[bool]:
@@ -274,7 +281,7 @@ def read_mapping(dataset: Dataset, answer: dict[str, Any]) -> Mapping:
     for a, b, count in answer["matches"]:
         matches[index[a], index[b]] = matches[index[b], index[a]] = count
     best_first = sorted(models, key=lambda m: (-len(m.rows), -m.observations / max(m.reprojection_px, 0.1)))
-    return Mapping(tuple(best_first), matches)
+    return Mapping(tuple(best_first), matches, answer.get("still", False))
 
 
 def _model(found: dict[str, Any], index: dict[str, int]) -> MappedModel:

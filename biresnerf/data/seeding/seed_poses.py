@@ -40,6 +40,11 @@ logger = logging.getLogger(__name__)
 
 LEAST_PLACED = 0.6  # of the images; a model of fewer says too little about a rig whose poses are given
 LEAST_REGISTERED = 0.4  # of images of which none has a pose; from fewer, the rest cannot be guessed
+STILL = (
+    "In many pairs of photos some features stay where they are while others move, as behind an object that was turned "
+    "before a still camera. Their matches were left out. The optimisation still sees what stands still: mask it, or "
+    "photograph before a plain background."
+)
 # Median likeness of all pairs of photos: from nearly one place 0.56 (LLFF's horns) to 0.87, around a scene 0.1 to 0.66.
 FACING_ALIKE = 0.4
 MATCHED: dict[str, PoseSource] = {"incremental": "matches-incremental", "global": "matches-global"}
@@ -159,8 +164,10 @@ def seed_poses(
             raise
         logger.error("%s The run goes on without feature matches.", error.fault)
         return _seeding(replace(dataset, faults=(*dataset.faults, error.fault)), given.without_matches())
+    if mapping.still:
+        given = _Given.of(replace(dataset, warnings=(*dataset.warnings, STILL)))
     if takes_back_offset:
-        given = _Given.of(without_offset(dataset, mapping.models))
+        given = _Given.of(without_offset(given.dataset, mapping.models))
     if start == "auto" and given.posed.any():
         return _beside_given(given, mapping)
     return _from_scratch(given, mapping, start)

@@ -65,6 +65,8 @@ def test_copies_of_a_photo_are_left_out_and_named(tmp_path: Path) -> None:
     for copy in set(whole.names) - set(part.names):
         assert copy in note
     assert without_copies(part) is part
+    kept = without_copies(whole, [name for name in whole.names if name.startswith("z")])
+    assert {Path(name).stem for name in kept.names} == {"0", "2", "z", "z2"}, "what is to stay, stays"
 
 
 def same(folder: Path, one: str, other: str) -> bool:
