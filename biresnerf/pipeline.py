@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 
 from biresnerf.compile_kernels import compile_kernels
+from biresnerf.data.formats.positions.control_points import control_points
 from biresnerf.data.formats.positions.known_distance import KnownDistance
 from biresnerf.data.formats.positions.position_priors import position_priors
 from biresnerf.data.formats.read_dataset import read_dataset
@@ -93,7 +94,7 @@ def refine_poses(
     dataset = without_copies(without_photos(dataset, setup.options.leave_out), setup.options.fixed)
     dataset = with_shared_predictions(dataset)
     dataset = _as_meant(dataset, setup.options)
-    dataset = replace(dataset, positions=position_priors(dataset))
+    dataset = replace(dataset, positions=position_priors(dataset), control=control_points(dataset))
     scene, origin = _seed(dataset, setup)
     stages = _first_step(scene, origin, setup, observer)
     keep_to_budget(stages, started, setup.options.steps)

@@ -9,7 +9,7 @@ from pydantic import Field
 from biresnerf.errors import Fault
 from biresnerf.frozen_model import FrozenModel
 from biresnerf.options.refine_options import ResolvedOptions
-from biresnerf.uncertainty import GeoReference, InputAccuracy, KnownScale, PoseUncertainty
+from biresnerf.uncertainty import ControlReport, GeoReference, InputAccuracy, KnownScale, PoseUncertainty
 
 SwitchReason = Literal["stable", "cap"]
 IntrinsicsSource = Literal["given", "exif", "predicted", "colmap", "guessed", "refined"]
@@ -287,6 +287,7 @@ class Report(FrozenModel):
         None, description="None where fewer than six poses were given, or nothing tells of them."
     )
     geo_reference: GeoReference | None = Field(None, description="None without measured positions.")
+    control_points: ControlReport | None = Field(None, description="None without a list of them.")
     known_scale: KnownScale | None = Field(None, description="None without the option known_distance.")
     steps_done: int = Field(examples=[2000])
     switch_step: int | None = Field(None, examples=[700], description="The step at which stage 2 began.")

@@ -71,6 +71,44 @@ class GeoReference(FrozenModel, allow_inf_nan=False):
     )
 
 
+class ControlPoint(FrozenModel, allow_inf_nan=False):
+    """A measured point as the returned cameras see it."""
+
+    name: str = Field(examples=["gcp02"])
+    check: bool = Field(description="Nothing was adjusted to it.")
+    images: int = Field(examples=[5], description="How many photos show it.")
+    error_m: tuple[float, float, float] = Field(
+        examples=[[0.012, -0.008, 0.021]], description="Where it is by them less where it was measured."
+    )
+    error_px: float = Field(
+        examples=[0.6], description="Root mean square distance from its marks in the photos."
+    )
+
+
+class ControlReport(FrozenModel, allow_inf_nan=False):
+    """Control points and check points at the returned poses, after the similarity that fits the control points best."""
+
+    source: str = Field(examples=["gcp_list.txt"])
+    points: tuple[ControlPoint, ...] = ()
+    control_m: float | None = Field(
+        None, examples=[0.02], description="Root mean square distance of the control points."
+    )
+    control_px: float | None = Field(None, examples=[0.6])
+    check_m: float | None = Field(
+        None, examples=[0.03], description="Of the check points: the error to expect elsewhere."
+    )
+    check_px: float | None = Field(None, examples=[0.7])
+    metres_from_world: tuple[_Row4, _Row4, _Row4, _Row4] | None = Field(
+        None,
+        description="4 x 4 similarity from the input's world to the points' frame, or to east, north and up.",
+    )
+    epsg: int | None = Field(None, examples=[32633], description="Of the frame, or of the origin.")
+    origin: tuple[float, float, float] | None = Field(
+        None, description="Latitude, longitude, height; None for a frame of metres."
+    )
+    why_not: str | None = Field(None, examples=["2 control points are seen in two photos, and 3 are needed"])
+
+
 class KnownScale(FrozenModel, allow_inf_nan=False):
     """The scale that a known distance gives, at the returned poses. They are not changed by it."""
 

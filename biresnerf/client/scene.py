@@ -28,6 +28,7 @@ def look_at(path: Path, video_frames: int = 0) -> Scene:
     Raises:
         InputError: the input cannot be used, or an image is outside its folder.
     """
+    from biresnerf.data.formats.positions.control_points import control_files
     from biresnerf.data.formats.positions.position_table import position_files
     from biresnerf.data.formats.read_dataset import read_dataset
     from biresnerf.data.photos.video.video_frames import VideoReading
@@ -46,7 +47,7 @@ def look_at(path: Path, video_frames: int = 0) -> Scene:
         poses = [(str(usual), dataset.source.file)]
     elif dataset.source.files and not path.is_dir():
         poses = _found_by_name(root, path, poses)
-    places = [(file.name, file) for file in position_files(root)]
+    places = [(file.name, file) for file in (*position_files(root), *control_files(root))]
     return _scene([*poses, *places, *((_name_below(root, file), file) for file in images + masks)])
 
 

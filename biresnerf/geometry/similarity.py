@@ -162,6 +162,17 @@ def align_robust(
     return b_from_a
 
 
+def align_points(in_a: Array, in_b: Array) -> Similarity:
+    """As `align_robust`, of points [n, 3]; a line leaves the turn about it open.
+
+    Raises:
+        ValueError: as `align_by_spread`.
+    """
+    rigs = np.tile(np.eye(4), (2, len(in_a), 1, 1))
+    rigs[0, :, :3, 3], rigs[1, :, :3, 3] = in_a, in_b
+    return align_robust(*rigs)
+
+
 def _align_weighted(
     a: Array,
     b: Array,

@@ -1,4 +1,4 @@
-"""Where the returned cameras lie among measured positions: for the report, and as a file for maps."""
+"""Where the returned cameras lie among measured places: for the report, and as a file for maps."""
 
 from __future__ import annotations
 
@@ -12,9 +12,11 @@ from biresnerf.data.formats.positions.position_priors import position_priors
 from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.measured_places import PositionPriors
+from biresnerf.data.points.located_points import located
 from biresnerf.geometry.earth.geodesy import place_of
 from biresnerf.geometry.earth.georeference import Georeference, NoGeoreference, fit_positions
-from biresnerf.uncertainty import GeoReference
+from biresnerf.geometry.similarity import Similarity
+from biresnerf.uncertainty import ControlPoint, ControlReport, GeoReference
 from biresnerf.write.output_folder import GEOREFERENCE
 
 
@@ -59,20 +61,51 @@ def _reference(priors: PositionPriors) -> GeoReference:
 def _with_fit(
     reference: GeoReference, priors: PositionPriors, fit: Georeference, names: Sequence[str]
 ) -> GeoReference:
-    matrix = np.eye(4)
-    matrix[:3, :3] = fit.metres_from_world.scale * fit.metres_from_world.rotation
-    matrix[:3, 3] = fit.metres_from_world.translation
     rows = zip(priors.rows.tolist(), fit.residual_m.tolist(), strict=True)
     return GeoReference.model_validate(
         {
             **reference.model_dump(),
             "used": int(fit.used.sum()),
             "doubt": fit.doubt or None,
-            "metres_from_world": tuple(map(tuple, matrix.tolist())),
+            "metres_from_world": _matrix(fit.metres_from_world),
             "residual_m": float(np.median(fit.residual_m[fit.used])),
             "residuals_m": {names[row]: round(residual, 4) for row, residual in rows},
         }
     )
+
+
+def control_report(dataset: Dataset, world_from_cam: NDArray[np.float64]) -> ControlReport | None:
+    """Control and check points at the returned poses [n, 4, 4] and lenses; None without any."""
+    points = dataset.control
+    if points is None:
+        return None
+    report = ControlReport(source=points.source, epsg=points.epsg, origin=points.origin)
+    try:
+        found = located(points, world_from_cam, [dataset.camera_of(i) for i in range(len(dataset))])
+    except NoGeoreference as reason:
+        return report.model_copy(update={"why_not": str(reason)})
+    images, square = np.bincount(points.point), (found.error_m**2).sum(1)
+    rows = zip(points.names, points.check, images, found.error_m, found.error_px, strict=True)
+    each = tuple(
+        ControlPoint(
+            name=name, check=bool(check), images=int(count), error_m=tuple(error.tolist()), error_px=float(px)
+        )
+        for name, check, count, error, px in rows
+    )
+    figures: dict[str, float | None] = {}
+    for kind, chosen in (("control", ~points.check), ("check", points.check)):
+        for unit, squares in (("m", square), ("px", found.error_px**2)):
+            figures[f"{kind}_{unit}"] = float(squares[chosen].mean() ** 0.5) if chosen.any() else None
+    return report.model_copy(
+        update={"points": each, "metres_from_world": _matrix(found.metres_from_world), **figures}
+    )
+
+
+def _matrix(similarity: Similarity) -> tuple[tuple[float, ...], ...]:
+    matrix = np.eye(4)
+    matrix[:3, :3] = similarity.scale * similarity.rotation
+    matrix[:3, 3] = similarity.translation
+    return tuple(map(tuple, matrix.tolist()))
 
 
 def _cameras(

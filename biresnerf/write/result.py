@@ -33,7 +33,7 @@ from biresnerf.refinement.views.evaluation import RenderedView, ViewScore
 from biresnerf.refinement.views.shown_views import Points
 from biresnerf.report import PointsReport, Report
 from biresnerf.viewer.report_html import write_report_html
-from biresnerf.write.georeference import write_georeference
+from biresnerf.write.georeference import control_report, write_georeference
 from biresnerf.write.output_folder import CONFIG, ORBIT, RENDERS, REPORT, OutputFolder
 
 logger = logging.getLogger(__name__)
@@ -83,10 +83,14 @@ def write_result(
             poses = f"{REFINED}/{POSES}"
     # A run that is stopped must end soon: it leaves large exports out.
     exports, monitor = (optimiser.options.exports, stages.monitor) if complete else ((), Monitor())
-    reference = write_georeference(returned_dataset, returned, path) if np.isfinite(returned).all() else None
+    finite = np.isfinite(returned).all()
+    reference = write_georeference(returned_dataset, returned, path) if finite else None
+    control = control_report(returned_dataset, returned) if finite else None
     distance = KnownDistance.of(optimiser.options.known_distance, scene.dataset)
     scale = distance.scale(returned) if distance is not None else None
-    report = report.model_copy(update={"geo_reference": reference, "known_scale": scale})
+    report = report.model_copy(
+        update={"geo_reference": reference, "control_points": control, "known_scale": scale}
+    )
     report, result = _write_poses(path, scene, returned_dataset, returned, report, field, exports, monitor)
     _write_view_file(path, scene, evaluation, moved or result, surface, poses)
     if reference is not None and reference.doubt:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from biresnerf.data.formats.bind_images import dataset_of
 from biresnerf.data.formats.folder import FolderContents, look_at, look_into
 from biresnerf.data.formats.parsed_poses import ParsedPoses, PoseEntry, without_problems
+from biresnerf.data.formats.positions.control_points import control_files, control_notes
 from biresnerf.data.formats.positions.position_priors import position_notes
 from biresnerf.data.formats.positions.position_table import position_files
 from biresnerf.data.formats.registry import ALL_CODECS
@@ -54,7 +55,7 @@ def read_dataset(
     if contents.format is None or contents.poses is None:
         images, notes = _with_video_frames(contents, within, videos)
         dataset = _read_images(contents.root, images, within, strict=strict)
-        known = position_files(contents.root)
+        known = [*position_files(contents.root), *control_files(contents.root)]
         notes += [] if contents.videos else pose_like_notes(contents.root, dataset.names, known)
         contents = replace(contents, notes=(*contents.notes, *notes))
     else:
@@ -67,7 +68,7 @@ def read_dataset(
         *contents.videos,
         *(path for f in dataset.frames for path in (f.path, f.mask) if path is not None),
     ]
-    contents = replace(contents, notes=(*contents.notes, *position_notes(dataset)))
+    contents = replace(contents, notes=(*contents.notes, *position_notes(dataset), *control_notes(dataset)))
     left_out = () if path in contents.videos else left_out_notes(contents.root, used)
     return replace(dataset, warnings=(*contents.notes, *left_out, *dataset.warnings))
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.model.colmap_scene import ColmapModel
-from biresnerf.data.model.measured_places import PositionPriors
+from biresnerf.data.model.measured_places import ControlPoints, PositionPriors
 from biresnerf.errors import Fault
 from biresnerf.geometry.body_offset import BodyOffset
 from biresnerf.geometry.camera.camera_models import Camera
@@ -95,6 +95,7 @@ class Dataset:
         faults: what failed on our side, so that evidence is missing that the photos may hold.
         body_offset: what all given poses lacked, and have now; None where nothing was found.
         positions: where the photos were taken, once that was asked; None where nothing says so.
+        control: points on the ground that were measured, once that was asked; None where there are none.
     """
 
     root: Path
@@ -106,6 +107,7 @@ class Dataset:
     faults: tuple[Fault, ...] = ()
     body_offset: BodyOffset | None = None
     positions: PositionPriors | None = None
+    control: ControlPoints | None = None
 
     def __post_init__(self) -> None:
         if all(by == "given" for by in self.intrinsics_sources):

@@ -34,3 +34,50 @@ class PositionPriors:
         return replace(
             self, rows=self.rows[kept], positions_m=self.positions_m[kept], accuracy_m=self.accuracy_m[kept]
         )
+
+
+@dataclass(frozen=True, eq=False)
+class ControlPoints:
+    """Places on the ground that were measured, and where photos show them; each is in two photos at least.
+
+    Attributes:
+        source: the file, for messages.
+        names: of the p points.
+        metres: float64 [p, 3]: along east, north and up from the origin, or in the source's own frame.
+        accuracy_m: float64 [p, 3], standard deviations along the axes; NaN where they are not said.
+        check: bool [p], points that nothing is adjusted to, to judge by.
+        point, image: int64 [m], of each observation, ascending.
+        xy: float64 [m, 2], px of the full-size photos.
+        origin, epsg: as those of `PositionPriors`.
+    """
+
+    source: str
+    names: tuple[str, ...]
+    metres: NDArray[np.float64]
+    accuracy_m: NDArray[np.float64]
+    check: NDArray[np.bool_]
+    point: NDArray[np.int64]
+    image: NDArray[np.int64]
+    xy: NDArray[np.float64]
+    origin: tuple[float, float, float] | None
+    epsg: int | None
+
+    def of(self, frames: NDArray[np.bool_]) -> ControlPoints:
+        """What these frames [n] alone show, with the same origin."""
+        return self.seen_in(frames[self.image])
+
+    def seen_in(self, observations: NDArray[np.bool_]) -> ControlPoints:
+        """Those of these observations [m] that leave a point two photos."""
+        count = np.bincount(self.point[observations], minlength=len(self.names))
+        kept = observations & (count >= 2)[self.point]
+        points, number = np.unique(self.point[kept], return_inverse=True)
+        return replace(
+            self,
+            names=tuple(self.names[i] for i in points.tolist()),
+            metres=self.metres[points],
+            accuracy_m=self.accuracy_m[points],
+            check=self.check[points],
+            point=number.astype(np.int64),
+            image=self.image[kept],
+            xy=self.xy[kept],
+        )

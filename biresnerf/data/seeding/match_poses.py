@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from biresnerf.data.formats.positions.position_priors import position_priors
 from biresnerf.data.model.dataset import Dataset, Frame
+from biresnerf.data.points.located_points import metres_from_world
 from biresnerf.data.seeding.map_images import MappedModel
 from biresnerf.geometry.body_offset import tie
-from biresnerf.geometry.earth.georeference import NoGeoreference, fit_positions
 from biresnerf.geometry.focus import focus_point
 from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.geometry.rigid import rigid_inverse, rotation_vectors
@@ -97,23 +97,19 @@ def carry_model(
 
 
 def in_measured_frame(matched: MatchedPoses, dataset: Dataset) -> MatchedPoses:
-    """Poses in metres in the frame of measured positions, where these tell it: for GPS along east, north and up.
+    """Poses in metres in the frame of control points or measured positions, where these tell it.
 
-    By a similarity that is robust to wrong positions. Otherwise the poses stay as they are.
+    For degrees along east, north and up; by a similarity that is robust to wrong positions. Otherwise they stay.
 
     Raises:
         InputError: ``positions_invalid``, or a code of `open_image`.
     """
-    priors = position_priors(dataset)
-    if priors is None:
+    if dataset.positions is None:
+        dataset = replace(dataset, positions=position_priors(dataset))
+    frame = metres_from_world(dataset, matched.world_from_cam, matched.placed)
+    if frame is None:
         return matched
-    priors = priors.of(matched.placed)
-    try:
-        fit = fit_positions(matched.world_from_cam[priors.rows], priors.positions_m)
-    except NoGeoreference as reason:
-        logger.info("%s gives no frame: %s", priors.source, reason)
-        return matched
-    found = fit.metres_from_world.apply_to_poses(matched.world_from_cam)
+    found = frame.apply_to_poses(matched.world_from_cam)
     return replace(
         matched, world_from_cam=np.where(matched.placed[:, None, None], found, matched.world_from_cam)
     )

@@ -255,7 +255,7 @@ def _from_scratch(given: _Given, mapping: Mapping, start: StartPoses) -> Seeding
             len(model.rows) < LEAST_PLACED * len(best.rows) or not adds_to(best, model)
         ):
             continue
-        matched = _tied(model, given)
+        matched = _tied(model, replace(given, dataset=dataset))
         unplaced = replace(given, dataset=dataset, posed=given.posed & ~matched.placed)
         name: PoseSource = "colmap" if model is best else MATCHED[model.mapper]
         candidates.append(unplaced.candidate(name, matched, "colmap", mapping.matches))

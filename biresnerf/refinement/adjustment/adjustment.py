@@ -20,8 +20,8 @@ from biresnerf.refinement.adjustment.lens.lenses import (
     LensEstimate,
     posterior,
 )
+from biresnerf.refinement.adjustment.measured_terms import measured_terms
 from biresnerf.refinement.adjustment.patch_term import PatchTerm
-from biresnerf.refinement.adjustment.position_term import PositionTerm
 from biresnerf.refinement.adjustment.solver.covariance import covariance, of_each, without_lenses
 from biresnerf.refinement.adjustment.solver.solve import Prior, minimise, normal_equations
 from biresnerf.refinement.adjustment.solver.term import Term
@@ -138,8 +138,8 @@ def _adjusted(
         start, evidence = cameras, replace(evidence, patches=None)
     tracks, patches = track_term(start, evidence, None), patch_term(start, evidence, patch_noise)
     terms: list[Term] = [term for term in (tracks, patches) if term is not None]
-    if terms and evidence.positions is not None:
-        terms.append(PositionTerm(evidence.positions, start))
+    if terms:
+        terms += measured_terms(evidence, start).values()
     found = minimise(start, terms, before) if terms else cameras
     if not all(np.isfinite(part).all() for part in (found.rotation, found.centre, found.lens)):
         found, terms = cameras, []

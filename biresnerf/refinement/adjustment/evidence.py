@@ -9,11 +9,14 @@ from numpy.typing import NDArray
 
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.camera import Intrinsics
+from biresnerf.geometry.focus import rms_spread
 from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.refinement.adjustment.lens.lenses import Lenses
 from biresnerf.refinement.adjustment.splines import blurred, spline_coefficients
 
 Array = NDArray[np.float64]
+
+EXACT = 1e-5  # of the spread of control points: no coordinates are more exact
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +117,26 @@ class Positions:
 
 
 @dataclass(frozen=True, eq=False)
+class Control:
+    """Points whose coordinates were measured, in a frame of its own.
+
+    Attributes:
+        tracks: where photos show them, through the evidence's intrinsics.
+        metres, deviation: [p, 3], and standard deviations along the axes, m.
+    """
+
+    tracks: Tracks
+    metres: Array
+    deviation: Array
+
+    @classmethod
+    def of(cls, tracks: Tracks, metres: Array, accuracy: Array) -> Control:
+        """From accuracies [p, 3], NaN where they are not known: the points' marks then tell how exact they are."""
+        exact = EXACT * rms_spread(metres)
+        return cls(tracks, metres, np.where(np.isfinite(accuracy), np.maximum(accuracy, exact), exact))
+
+
+@dataclass(frozen=True, eq=False)
 class Evidence:
     """What the poses are adjusted to.
 
@@ -123,7 +146,7 @@ class Evidence:
         tracks: None where there are none.
         patches: None where there are none.
         lenses: how the lenses differ from the intrinsics, and how well that is known; None: not at all.
-        positions: None where none are measured, or they tell nothing.
+        positions, control: None where none are measured, or they tell nothing.
     """
 
     intrinsics: Intrinsics
@@ -131,6 +154,14 @@ class Evidence:
     patches: Patches | None = None
     lenses: Lenses | None = None
     positions: Positions | None = None
+    control: Control | None = None
+
+    @property
+    def held_by_measurements(self) -> NDArray[np.int64]:
+        """Images whose place in the rig measured places hold: with control points, all that tracks tie."""
+        held = [] if self.positions is None else [self.positions.image]
+        held += [self.tracks.image] if self.control is not None and self.tracks is not None else []
+        return np.unique(np.concatenate([np.zeros(0, np.int64), *held]))
 
     def __post_init__(self) -> None:
         if bool(self.intrinsics.distortion[~self.intrinsics.fisheye].any()):

@@ -42,6 +42,7 @@ class TrackTerm:
     Attributes:
         unknowns: the points [p, 3] in the world.
         noise_px: standard deviation of either coordinate of an observation.
+        known, place: inverse covariances [p, 3, 3] of points about where they are known to be [p, 3]; zero.
     """
 
     def __init__(
@@ -65,6 +66,7 @@ class TrackTerm:
         world = np.einsum("mij,mj->mi", cameras.rotation[self.image], rays)
         focal = np.sqrt(self.lens[:, 0] * self.lens[:, 1])[self.image]
         self.unknowns = triangulate(cameras.centre[self.image], world, focal, self.point, count)
+        self.known, self.place = np.zeros((count, 3, 3)), np.zeros((count, 3))
 
     def errors_px(self, cameras: Cameras) -> Array:
         """Length of the residual of each observation [m], px; infinite where it is not in front."""
@@ -88,7 +90,12 @@ class TrackTerm:
         """Points to where they fit best for cameras that stay."""
         in_parts(
             lambda part: settle_points(
-                *self._seen(cameras, self.unknowns, part), self.noise_px, ROBUST_SCALE, SETTLING
+                *self._seen(cameras, self.unknowns, part),
+                self.known[part],
+                self.place[part],
+                self.noise_px,
+                ROBUST_SCALE,
+                SETTLING,
             ),
             len(self.unknowns),
         )
@@ -121,7 +128,8 @@ class TrackTerm:
         return np.asarray(1 - (mean**2).sum(1) > np.sin(APART / 2) ** 2)
 
     def cost(self, cameras: Cameras, unknowns: Array) -> float:
-        return float(track_cost(*self._seen(cameras, unknowns), self.noise_px, ROBUST_SCALE))
+        seen = self._seen(cameras, unknowns)
+        return float(track_cost(*seen, self.known, self.place, self.noise_px, ROBUST_SCALE))
 
     def linearise(self, cameras: Cameras, damping: float) -> Linearised:
         size, rows = cameras.unknowns, cameras.rows(self.image)
@@ -129,7 +137,7 @@ class TrackTerm:
 
         def linearised(points: slice) -> tuple[Array, Array, tuple[Array, Array]]:
             system, right = np.zeros((size, size)), np.zeros(size)
-            seen = self._seen(cameras, self.unknowns, points)
+            seen = (*self._seen(cameras, self.unknowns, points), self.known[points], self.place[points])
             back = track_system(*seen, rows, cameras.kinds, *fixed, system, right, mixed)
             return system, right, back
 

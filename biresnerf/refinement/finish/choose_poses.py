@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.refinement.adjustment.adjustment import NOTHING_FITS, Adjustment, adjust_poses, misfit
+from biresnerf.refinement.adjustment.cameras import Cameras
 from biresnerf.refinement.adjustment.choice import Candidate, choose
 from biresnerf.refinement.adjustment.evidence import Evidence, NoiseLevels, PosePrior
-from biresnerf.refinement.adjustment.position_term import position_misfits
+from biresnerf.refinement.adjustment.measured_terms import measured_misfits
 from biresnerf.refinement.adjustment.solver.covariance import NOTHING_KNOWN
 from biresnerf.refinement.finish.candidates import (
     BY_TRACKS,
@@ -55,8 +56,7 @@ def choose_poses(
     if not np.isfinite(refined).all():
         return None
     loose = np.full(len(refined), PRIOR)
-    if split.fitted.positions is not None:  # a bend of all cameras would be held by a prior of its own
-        loose[split.fitted.positions.image] = NOTHING_KNOWN
+    loose[split.fitted.held_by_measurements] = NOTHING_KNOWN  # a prior would hold a bend of all cameras
     prior = PosePrior(refined, loose, loose * optimiser.frame.distance, optimiser.bodies)
     cameras = optimiser.lenses.refined(scene.dataset).cameras
     lenses = supported_lenses(refined, split.fitted, split.left_out, prior, cameras, announce)
@@ -81,9 +81,9 @@ def choose_poses(
         return None
     by_tracks = results.get("adjusted-tracks")
     alike = {} if by_tracks is None else {"tracks": _within(candidates, by_tracks, split, optimiser.bodies)}
-    if split.fitted.positions is not None:
-        poses = np.stack([candidate.world_from_cam for candidate in candidates])
-        misfits["positions"], alike["positions"] = position_misfits(poses, split.fitted.positions)
+    rigs = [(Cameras.of(c.world_from_cam, c.lenses), split.fitted) for c in candidates]
+    for kind, (misfit_to, as_well) in measured_misfits(rigs).items():
+        misfits[kind], alike[kind] = misfit_to, as_well
     choice = choose(candidates, misfits, alike, _kept_on_a_tie(candidates, set(misfits), alike))
     announce()
     chosen, evidence = choice.chosen, dict.fromkeys(results, split.fitted)

@@ -12,7 +12,7 @@ from biresnerf.geometry.similarity import Similarity, align_by_spread
 from biresnerf.refinement.adjustment.adjustment import patch_term, track_term
 from biresnerf.refinement.adjustment.cameras import Cameras
 from biresnerf.refinement.adjustment.evidence import Evidence
-from biresnerf.refinement.adjustment.position_term import PositionTerm
+from biresnerf.refinement.adjustment.measured_terms import measured_terms
 from biresnerf.refinement.adjustment.solver.covariance import (
     covariance,
     largest_group,
@@ -116,8 +116,9 @@ def expected_errors(
         patches.settle(cameras)
         by_patches[patches.patches.target] = by_patches[patches.patches.host] = True
         information += patches.linearise(cameras, 0.0).system / PATCH_MODEL_ERROR**2
-    if evidence.positions is not None and information.any():
-        information += PositionTerm(evidence.positions, cameras).linearise(cameras, 0.0).system
+    for term in measured_terms(evidence, cameras).values() if information.any() else ():
+        term.measure(cameras)
+        information += term.linearise(cameras, 0.0).system
     # Photos of another scene match each other, but say nothing of where the others stand.
     together = largest_group(information, n)
     if lenses is not None:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.points.located_points import located
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.earth.georeference import NoGeoreference, fit_positions
-from biresnerf.refinement.adjustment.evidence import Evidence, Positions
+from biresnerf.refinement.adjustment.evidence import Control, Evidence, Positions
 from biresnerf.refinement.adjustment.ideal import ideal_cameras, straight_tracks
 from biresnerf.refinement.finish.lens_evidence import lenses_before
 from biresnerf.refinement.finish.photo_evidence import photo_patches
@@ -64,28 +66,44 @@ def gather_evidence(scene: Scene, optimiser: JointOptimiser) -> SplitEvidence:
         fitted, judging = tracks.split()
         tracks = tracks.thinned(MOST_IN_THE_END, len(dataset))
         fitted = fitted and fitted.thinned(MOST_OBSERVATIONS, len(dataset))
-    positions = measured_positions(scene.dataset, optimiser.poses.poses().numpy(), placed)
+    measured = measured_evidence(dataset, optimiser.poses.poses().numpy(), placed)
     patches = photo_patches(scene, optimiser, intrinsics, ideal, placed)
     if patches is None:
         return SplitEvidence(
-            Evidence(ideal, fitted, None, lenses, positions), Evidence(ideal, judging), tracks, placed
+            replace(measured, tracks=fitted, lenses=lenses), Evidence(ideal, judging), tracks, placed
         )
     spared = np.arange(len(patches)) % LEFT_OUT_ONE_IN == 0
     return SplitEvidence(
-        Evidence(ideal, fitted, patches.of(~spared), lenses, positions),
+        replace(measured, tracks=fitted, patches=patches.of(~spared), lenses=lenses),
         Evidence(ideal, judging, patches.of(spared)),
         tracks,
         placed,
     )
 
 
-def measured_positions(dataset: Dataset, poses: Array, placed: NDArray[np.bool_]) -> Positions | None:
-    """Of placed cameras [n] at these poses [n, 4, 4], where they tell a frame; not of those far beyond the others."""
-    if dataset.positions is None or not np.isfinite(poses).all():
-        return None
-    priors = dataset.positions.of(placed)
-    try:
-        used = fit_positions(poses[priors.rows], priors.positions_m).used
-    except NoGeoreference:
-        return None
-    return Positions.of(priors.rows[used], priors.positions_m[used], priors.accuracy_m[used])
+def measured_evidence(dataset: Dataset, poses: Array, placed: NDArray[np.bool_]) -> Evidence:
+    """The measured places of a set, where they tell a frame of placed cameras [n] at these poses [n, 4, 4].
+
+    Not positions that are far beyond the others, nor check points.
+    """
+    lenses = [dataset.camera_of(i) for i in range(len(dataset))]
+    intrinsics = Intrinsics.from_cameras(lenses)
+    evidence = Evidence(ideal_cameras(intrinsics))
+    if not np.isfinite(poses).all():
+        return evidence
+    if dataset.positions is not None:
+        priors = dataset.positions.of(placed)
+        with suppress(NoGeoreference):
+            used = fit_positions(poses[priors.rows], priors.positions_m).used
+            positions = Positions.of(priors.rows[used], priors.positions_m[used], priors.accuracy_m[used])
+            evidence = replace(evidence, positions=positions)
+    if dataset.control is not None:
+        with suppress(NoGeoreference):
+            points = dataset.control.of(placed)
+            located(points, poses, lenses)
+            points = points.seen_in(~points.check[points.point])
+            tracks = straight_tracks(
+                Tracks(points.point, points.image, points.xy), intrinsics, evidence.intrinsics
+            )
+            evidence = replace(evidence, control=Control.of(tracks, points.metres, points.accuracy_m))
+    return evidence

@@ -73,6 +73,7 @@ def heeded(name: CandidateName, found: Adjustment, evidence: Evidence) -> Eviden
         evidence.patches if name != "adjusted-tracks" else None,
         lenses,
         evidence.positions,
+        evidence.control,
     )
 
 

@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from biresnerf.data.model.dataset import Dataset
-from biresnerf.geometry.earth.georeference import NoGeoreference, fit_positions
+from biresnerf.data.points.located_points import metres_from_world
 from biresnerf.geometry.similarity import Similarity, align_by_spread, align_robust
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.parameters.intrinsics_parameters import IntrinsicsParameters
 
 Array = NDArray[np.float64]
 
-IN_METRES = 0.01  # a scale so near one is that of positions: others have no unit
+IN_METRES = 0.01  # a scale so near one is that of measured places: others have no unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,30 +55,29 @@ class RefinedPoses:
 
         The similarity that fits the optimised poses to the given ones best fixes them; it is robust to lost cameras
         unless the method says otherwise. Fixed cameras and rigs leave less free. Where nobody gave poses, measured
-        positions fix the frame that they gave to those that were found.
+        places fix the frame that they gave to those that were found.
         """
         optimised = optimiser.frame.unit_from_world.inverse().apply_to_poses(unit_from_cam)
         given, tied = dataset.world_from_cam, dataset.anchors
         input_from_optimised = optimiser.bodies.input_from_optimised(optimised, given)
-        input_from_optimised = input_from_optimised or _by_positions(dataset, optimised)
+        refined = lenses.refined(dataset)
+        input_from_optimised = input_from_optimised or _as_measured(dataset, optimised, refined)
         if input_from_optimised is None and optimiser.method.robust_frame:
             input_from_optimised = align_robust(optimised[tied], given[tied], with_rotations=True)
         elif input_from_optimised is None:
             input_from_optimised = align_by_spread(optimised[tied], given[tied])
         carried = optimiser.bodies.restored(input_from_optimised.apply_to_poses(optimised), given)
-        return cls(carried, input_from_optimised, lenses, lenses.refined(dataset))
+        return cls(carried, input_from_optimised, lenses, refined)
 
 
-def _by_positions(dataset: Dataset, optimised: Array) -> Similarity | None:
-    """What carries optimised poses [n, 4, 4] to measured positions, if the set's own were found and carried there."""
-    positions = dataset.positions
-    if positions is None or any(frame.pose_source == "given" for frame in dataset.frames):
+def _as_measured(dataset: Dataset, optimised: Array, refined: Dataset) -> Similarity | None:
+    """What carries optimised poses [n, 4, 4] to measured places, if the set's own were found and carried there.
+
+    Args:
+        refined: the set seen through the refined lenses.
+    """
+    if any(frame.pose_source == "given" for frame in dataset.frames):
         return None
-    try:
-        there, found = (
-            fit_positions(poses[positions.rows], positions.positions_m).metres_from_world
-            for poses in (dataset.world_from_cam, optimised)
-        )
-    except NoGeoreference:
-        return None
-    return found if abs(there.scale - 1) < IN_METRES else None
+    there = metres_from_world(dataset, dataset.world_from_cam)
+    found = metres_from_world(refined, optimised)
+    return found if there is not None and abs(there.scale - 1) < IN_METRES else None

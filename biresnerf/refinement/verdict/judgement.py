@@ -15,8 +15,9 @@ from biresnerf.data.model.dataset import GUESSES, Dataset
 from biresnerf.data.workload import JUDGING
 from biresnerf.geometry.focus import focus_point, rms_spread
 from biresnerf.geometry.pose_error import rotation_between_deg
-from biresnerf.refinement.adjustment.position_term import position_misfits
-from biresnerf.refinement.finish.gather_evidence import measured_positions
+from biresnerf.refinement.adjustment.cameras import Cameras
+from biresnerf.refinement.adjustment.measured_terms import measured_misfits
+from biresnerf.refinement.finish.gather_evidence import measured_evidence
 from biresnerf.refinement.lost.own_matches import contradicted
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.scene.scene import Scene
@@ -175,18 +176,27 @@ def compare_without_training(scene: Scene, refined: RefinedPoses, lost: int) -> 
         out_of_frame=frame_doubt(turned, shifted, spread) if grounded and not failed else "",
         faults=tuple(map(str, dataset.faults)),
         offset=dataset.body_offset is not None,
-        favoured_by_positions=_favoured_by_positions(dataset, before, after, placed),
+        favoured_by_positions=_favoured_by_positions(dataset, before, after, refined.dataset, placed),
     )
     return Compared(before, after, placed, turned, shifted, findings)
 
 
-def _favoured_by_positions(dataset: Dataset, before: Rig, after: Rig, placed: NDArray[np.bool_]) -> int:
-    """The poses that measured positions fit better beyond chance: 1 the refined ones, -1 the input's, 0 neither."""
-    positions = measured_positions(dataset, after.world_from_cam, placed)
-    if positions is None:
-        return 0
-    _, alike = position_misfits(np.stack([before.world_from_cam, after.world_from_cam]), positions)
-    return int(alike[1]) - int(alike[0])
+def _favoured_by_positions(
+    dataset: Dataset, before: Rig, after: Rig, refined: Dataset, placed: NDArray[np.bool_]
+) -> int:
+    """The poses that measured places fit better beyond chance: 1 the refined ones, -1 the input's, 0 neither."""
+    old = measured_evidence(dataset, before.world_from_cam, placed)
+    new = measured_evidence(refined, after.world_from_cam, placed)
+    if old.positions is None or new.positions is None:
+        old, new = replace(old, positions=None), replace(new, positions=None)
+    if old.control is None or new.control is None:
+        old, new = replace(old, control=None), replace(new, control=None)
+    rigs = [
+        (Cameras.of(before.world_from_cam), replace(old, positions=new.positions)),
+        (Cameras.of(after.world_from_cam), new),
+    ]
+    votes = {int(alike[1]) - int(alike[0]) for _, alike in measured_misfits(rigs).values()} - {0}
+    return votes.pop() if len(votes) == 1 else 0
 
 
 def motion(before: Array, after: Array) -> tuple[Array, Array]:

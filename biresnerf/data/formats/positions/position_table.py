@@ -114,7 +114,7 @@ def _geo_txt(source: str, lines: Sequence[str], first: int) -> PositionTable:
             flat.append(number)
         else:
             rows[number] = cells
-    degrees, metres, epsg = _frame_of(lines[first], list(rows.values()), f"{source} line {first + 1}")
+    degrees, metres, epsg = frame_of(lines[first], list(rows.values()), f"{source} line {first + 1}")
     places: dict[str, MeasuredPlace] = {}
     for number, cells in rows.items():
         where = f"{source} line {number}"
@@ -130,7 +130,7 @@ def _geo_txt(source: str, lines: Sequence[str], first: int) -> PositionTable:
     return PositionTable(source, places, degrees, epsg, notes)
 
 
-def _frame_of(header: str, rows: Sequence[Sequence[str]], where: str) -> tuple[bool, float, int | None]:
+def frame_of(header: str, rows: Sequence[Sequence[str]], where: str) -> tuple[bool, float, int | None]:
     """Whether the first line of a geo.txt names a frame of degrees, else its metres per unit, and EPSG's number.
 
     It is ``EPSG:n``, ``WGS84 UTM 32N`` or a string of PROJ. Of the geographic ones among EPSG's numbers few are known

@@ -2,7 +2,8 @@
 
 The definitions are in `biresnerf.refinement.adjustment.reference`. A point's observations lie one after the other.
 Cameras are R = rotation [n, 3, 3] (world from cam), c = centre [n, 3]; lenses are those of `lens`. An increment of a
-camera is a rotation vector w and a shift s, both in the world's axes: exp(w) R and c + s.
+camera is a rotation vector w and a shift s, both in the world's axes: exp(w) R and c + s. What is
+known of points before is (x - place)^T known (x - place), zero for most: known [p, 3, 3], place [p, 3].
 """
 
 from __future__ import annotations
@@ -72,6 +73,19 @@ def inverse3(m, out):
     return True
 
 
+@njit(inline="always", **KERNEL)
+def known_before(known, place, point, normal, gradient):
+    """Starts a point's normal equations [3, 3] and [3] with what is known of it; returns its cost."""
+    cost = 0.0
+    for a in range(3):
+        gradient[a] = 0
+        for b in range(3):
+            normal[a, b] = known[a, b]
+            gradient[a] += known[a, b] * (point[b] - place[b])
+        cost += gradient[a] * (point[a] - place[a])
+    return cost
+
+
 @njit(**KERNEL)
 def track_errors(rotation, centre, lens, xyz, start, image, xy, squared):
     """Squared residual [m] of each observation, px^2; infinite where it is not in front."""
@@ -83,7 +97,7 @@ def track_errors(rotation, centre, lens, xyz, start, image, xy, squared):
 
 
 @njit(**KERNEL)
-def settle_points(rotation, centre, lens, xyz, start, image, xy, sigma, scale, rounds):
+def settle_points(rotation, centre, lens, xyz, start, image, xy, known, place, sigma, scale, rounds):
     """Move each point to the least robust cost for cameras that stay; Levenberg-Marquardt, in place."""
     r, v, q, jac = np.empty(2), np.empty(3), np.empty(3), np.empty((2, 3))
     normal, inverse, gradient, tried = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
@@ -92,9 +106,7 @@ def settle_points(rotation, centre, lens, xyz, start, image, xy, sigma, scale, r
         cost, damping = np.inf, 1e-4
         tried[:] = xyz[i]
         for _ in range(rounds):
-            now = 0.0
-            normal[:] = 0
-            gradient[:] = 0
+            now = known_before(known[i], place[i], tried, normal, gradient)
             for e in range(start[i], start[i + 1]):
                 if not project_point(rotation, centre, lens, image[e], tried, xy[e], r, v, q):
                     now += s2
@@ -130,11 +142,12 @@ def settle_points(rotation, centre, lens, xyz, start, image, xy, sigma, scale, r
 
 
 @njit(**KERNEL)
-def track_cost(rotation, centre, lens, xyz, start, image, xy, sigma, scale):
-    """Sum of the robust squares of all observations."""
-    r, v, q = np.empty(2), np.empty(3), np.empty(3)
+def track_cost(rotation, centre, lens, xyz, start, image, xy, known, place, sigma, scale):
+    """Sum of the robust squares of all observations, and of the points' distances from where they are known to be."""
+    r, v, q, normal, gradient = np.empty(2), np.empty(3), np.empty(3), np.empty((3, 3)), np.empty(3)
     s2, iv, cost = scale * scale, 1.0 / (sigma * sigma), 0.0
     for i in range(len(xyz)):
+        cost += known_before(known[i], place[i], xyz[i], normal, gradient)
         for e in range(start[i], start[i + 1]):
             if project_point(rotation, centre, lens, image[e], xyz[i], xy[e], r, v, q):
                 e2 = (r[0] * r[0] + r[1] * r[1]) * iv
@@ -178,7 +191,8 @@ def eliminate_point(rows, first, last, blocks, forces, mixed, inverse, gradient,
 
 @njit(**KERNEL)
 def track_system(
-    rotation, centre, lens, xyz, start, image, xy, rows, kinds, sigma, scale, damping, system, right, mixed
+    rotation, centre, lens, xyz, start, image, xy, known, place, rows, kinds, sigma, scale, damping, system, right,
+    mixed,
 ):  # fmt: skip
     """Add the normal equations without the points to system [u, u] and right [u], which is half the gradient.
 
@@ -200,7 +214,7 @@ def track_system(
         most = max(most, start[i + 1] - start[i])
     blocks, forces = np.empty((most, width, width)), np.empty((most, width))
     for i in range(points):
-        own[:] = 0
+        known_before(known[i], place[i], xyz[i], own, gradients[i])
         first = start[i]
         for e in range(first, start[i + 1]):
             blocks[e - first] = 0

@@ -1,4 +1,4 @@
-"""Measured positions hold the shape of a rig, as far as they are exact, and its frame stays free."""
+"""Measured places hold the shape of a rig, as far as they are exact, and its frame stays free."""
 
 import numpy as np
 import pytest
@@ -8,12 +8,13 @@ from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.camera import Intrinsics, project
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.lie import so3_exp
-from biresnerf.geometry.similarity import Similarity, align_robust
+from biresnerf.geometry.similarity import Similarity, align_points, align_robust
 from biresnerf.refinement.adjustment.adjustment import adjust_poses
 from biresnerf.refinement.adjustment.cameras import Cameras
-from biresnerf.refinement.adjustment.evidence import Evidence, PosePrior, Positions
+from biresnerf.refinement.adjustment.evidence import Control, Evidence, PosePrior, Positions
 from biresnerf.refinement.adjustment.lens.lenses import Lenses
-from biresnerf.refinement.adjustment.position_term import PositionTerm, position_misfits
+from biresnerf.refinement.adjustment.measured_terms import ControlTerm, PositionTerm, measured_misfits
+from biresnerf.refinement.adjustment.track_term import TrackTerm
 
 COLUMNS, ROWS, HEIGHT_M, STEP_M = 6, 5, 100.0, 25.0
 COUNT = COLUMNS * ROWS
@@ -35,15 +36,19 @@ def flight(rng):
     poses[:, :3, :3] = turn @ np.diag([1.0, -1, -1])
     poses[:, :3, 3] = np.stack([x.ravel(), y.ravel(), np.full(COUNT, HEIGHT_M)], 1)
     land = np.column_stack([rng.uniform(-60, 190, 800), rng.uniform(-60, 160, 800), rng.normal(0, 2, 800)])
+    tracks = observed_from(poses, land, rng)
+    poses[:, :3, 3] += METRES_FROM_WORLD.translation
+    return METRES_FROM_WORLD.inverse().apply_to_poses(poses), tracks
+
+
+def observed_from(poses, land, rng, noise_px=0.5):
+    """What photos show of points."""
     point, image = (index.ravel() for index in np.indices((len(land), COUNT)))
     in_cam = np.einsum("mji,mj->mi", poses[image, :3, :3], land[point] - poses[image, :3, 3])
     lenses = Intrinsics.from_cameras([LENS] * COUNT)
     xy = project(lenses, torch.from_numpy(image), torch.from_numpy(in_cam)).numpy()
     seen = ((xy > 0) & (xy < [WIDTH, HEIGHT])).all(1)
-    xy = xy + rng.normal(0, 0.5, xy.shape)
-    poses[:, :3, 3] += METRES_FROM_WORLD.translation
-    tracks = Tracks.of(point[seen], image[seen], xy[seen])
-    return METRES_FROM_WORLD.inverse().apply_to_poses(poses), tracks
+    return Tracks.of(point[seen], image[seen], xy[seen] + rng.normal(0, noise_px, (int(seen.sum()), 2)))
 
 
 def measured(truth, rng, sigma_m, stated_m):
@@ -51,9 +56,20 @@ def measured(truth, rng, sigma_m, stated_m):
     return Positions.of(np.arange(COUNT), there, np.full((COUNT, 3), stated_m))
 
 
-def adjusted(start, tracks, positions=None, lenses=FREE):
+def marked(truth, rng, sigma_m, points=8, noise_px=0.5):
+    """Control points on the land, where hands marked them."""
+    land = np.column_stack([rng.uniform(-20, 145, points), rng.uniform(-20, 120, points), np.zeros(points)])
+    tracks = observed_from(
+        METRES_FROM_WORLD.apply_to_poses(truth), land + METRES_FROM_WORLD.translation, rng, noise_px
+    )
+    coordinates = land + METRES_FROM_WORLD.translation + rng.normal(0, sigma_m, (points, 3))
+    return Control.of(tracks, coordinates, np.full((points, 3), sigma_m))
+
+
+def adjusted(start, tracks, positions=None, lenses=FREE, control=None):
     prior = PosePrior.equal(start, 1.0, HEIGHT_M / METRES_FROM_WORLD.scale)
-    return adjust_poses(start, Evidence(GUESS, tracks, lenses=lenses, positions=positions), prior)
+    evidence = Evidence(GUESS, tracks, lenses=lenses, positions=positions, control=control)
+    return adjust_poses(start, evidence, prior)
 
 
 def errors_m(poses, truth):
@@ -72,8 +88,9 @@ def test_a_flight_that_an_unknown_lens_bends_is_straightened_by_positions(seed, 
     found = adjusted(bent, tracks, measured(truth, rng, 0.02, 0.02 if stated else np.nan))
     assert errors_m(found.world_from_cam, truth) < 0.05
     assert found.lenses.correction[0, 1] == pytest.approx(-0.03, abs=0.004)
-    _, alike = position_misfits(np.stack([bent, found.world_from_cam]), measured(truth, rng, 0.02, 0.02))
-    assert alike.tolist() == [False, True]
+    measured_again = Evidence(GUESS, positions=measured(truth, rng, 0.02, 0.02))
+    rigs = [(Cameras.of(poses), measured_again) for poses in (bent, found.world_from_cam)]
+    assert measured_misfits(rigs)["positions"][1].tolist() == [False, True]
 
 
 def test_an_accuracy_that_residuals_contradict_is_not_believed():
@@ -101,8 +118,8 @@ def test_coarse_positions_do_no_harm_and_leave_the_frame():
     coarse = measured(truth, rng, 3.0, np.nan)
     found = adjusted(truth, tracks, coarse).world_from_cam
     assert errors_m(found, truth) < errors_m(alone, truth) + 0.03
-    _, alike = position_misfits(np.stack([alone, found]), coarse)
-    assert alike.all()
+    rigs = [(Cameras.of(poses), Evidence(GUESS, positions=coarse)) for poses in (alone, found)]
+    assert measured_misfits(rigs)["positions"][1].all()
 
 
 def test_the_normal_equations_are_the_slopes_of_the_cost():
@@ -117,3 +134,50 @@ def test_the_normal_equations_are_the_slopes_of_the_cost():
         motion[unknown] = step
         ahead, back = (term.cost(cameras.moved(sign * motion), term.unknowns) for sign in (1, -1))
         assert (ahead - back) / (4 * step) == pytest.approx(right[unknown], rel=1e-4)
+
+
+def land_errors_m(found, land):
+    """Root mean square distance of points on the land from where they are, after alignment, m."""
+    lenses = FREE if found.lenses is None else FREE.known(found.lenses.correction)
+    cameras = Cameras.of(found.world_from_cam, lenses)
+    term = TrackTerm(land.tracks, GUESS, cameras, 0.5)
+    term.settle(cameras)
+    apart = align_points(term.unknowns, land.metres).apply(term.unknowns) - land.metres
+    return float(np.sqrt((apart**2).sum(1).mean()))
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_control_points_straighten_what_cameras_see_and_a_wrong_one_has_no_say(seed):
+    rng = np.random.default_rng(seed)
+    truth, tracks = flight(rng)
+    tracks = tracks.where(tracks.point < 60)
+    control, others = marked(truth, rng, 0.02, 12), marked(truth, rng, 0.0, 30, 0.0)
+    control.metres[3] += [5.0, 0, 0]
+    bent = adjusted(truth, tracks, lenses=None)
+    free = adjusted(bent.world_from_cam, tracks)
+    found = adjusted(bent.world_from_cam, tracks, control=control)
+    assert land_errors_m(bent, others) > 0.5
+    assert land_errors_m(found, others) < min(0.08, 0.4 * land_errors_m(free, others))
+    lenses = FREE.known(found.lenses.correction)
+    rigs = [Cameras.of(bent.world_from_cam), Cameras.of(found.world_from_cam, lenses)]
+    misfits = measured_misfits([(rig, Evidence(GUESS, control=control)) for rig in rigs])
+    assert misfits["control"][1].tolist() == [False, True]
+
+
+def test_points_that_are_known_before_are_part_of_the_normal_equations():
+    rng = np.random.default_rng(6)
+    truth, _ = flight(rng)
+    cameras = Cameras.of(truth)
+    term = ControlTerm(marked(truth, rng, 0.05), GUESS, cameras)
+    term.measure(cameras)
+
+    def least(motion):
+        moved = cameras.moved(motion)
+        term.settle(moved)
+        return term.cost(moved, term.unknowns)
+
+    right, step = term.linearise(cameras, 0.0).right, 1e-6
+    for unknown in (3, 6 * 7 + 1, 6 * 13 + 5):
+        motion = np.zeros(cameras.unknowns)
+        motion[unknown] = step
+        assert (least(motion) - least(-motion)) / (4 * step) == pytest.approx(right[unknown], rel=1e-3)

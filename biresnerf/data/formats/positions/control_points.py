@@ -1,0 +1,172 @@
+"""Ground control points and check points: OpenDroneMap's gcp_list.txt, and csv with a header."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from biresnerf.data.formats.match_names import match_files
+from biresnerf.data.formats.positions.position_table import WGS84, frame_of
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.model.measured_places import ControlPoints
+from biresnerf.data.model.untrusted_file import read_text
+from biresnerf.errors import InputError
+from biresnerf.geometry.earth.geodesy import east_north_up
+
+CONTROL_FILES = ("gcp_list.txt", "gcp_file.txt", "gcp.csv", "control_points.csv")
+_HINT = (
+    "gcp_list.txt: a frame such as EPSG:32633, then rows of x y z px py image name. gcp.csv: a header with "
+    "name,x,y,z,image,px,py, or lat,lon,alt for x,y,z."
+)
+_CHECKS = {"1", "true", "yes", "check"}
+_ALIASES = {"label": "name", "photo": "image", "file": "image", "alt": "z", "height": "z", "latitude": "lat",
+            "longitude": "lon", "easting": "x", "northing": "y", "accuracyz": "zaccuracy"}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Row:
+    """A line of a file: a point, and where a photo shows it; empty and NaN where none does."""
+
+    where: str
+    name: str
+    check: bool
+    place: tuple[float, float, float]
+    accuracy: tuple[float, float, float]
+    image: str
+    xy: tuple[float, float]
+
+
+def control_files(root: Path) -> list[Path]:
+    """The files in the folder ``root`` that are called as lists of control points, the preferred one first."""
+    files = {path.name.lower(): path for path in sorted(root.iterdir()) if path.is_file()}
+    return [files[name] for name in CONTROL_FILES if name in files]
+
+
+def control_points(dataset: Dataset) -> ControlPoints | None:
+    """Those that two photos of the set show, of the first file beside the photos; None without such a file or point.
+
+    Raises:
+        InputError: ``control_points_invalid``, with the line.
+    """
+    file = next(iter(control_files(dataset.root)), None)
+    if dataset.control is not None or file is None:
+        return dataset.control
+    rows, degrees, epsg = (_of_csv if file.suffix.lower() == ".csv" else _of_odm)(file)
+    found, _ = match_files(list(dict.fromkeys(row.image for row in rows if row.image)), dataset.file_names)
+    frame = {name: dataset.file_names.index(known) for name, known in found.items()}
+    names = list(dict.fromkeys(row.name for row in rows))
+    first = [next(row for row in rows if row.name == name) for name in names]
+    for row in rows:
+        if row.place != first[names.index(row.name)].place:
+            raise _invalid(row.where, f"has other coordinates of {row.name[:100]!r} than a line before.")
+    seen = {(names.index(row.name), frame[row.image]): row.xy for row in rows if row.image in frame}
+    if not seen:
+        return None
+    places, origin = np.array([row.place for row in first]), None
+    if degrees:
+        origin = tuple(np.median(places, axis=0).tolist())
+        places = east_north_up(places, np.array(origin))
+    index = np.array(sorted(seen), dtype=np.int64)
+    points = ControlPoints(
+        file.name, tuple(names), places, np.array([row.accuracy for row in first]),
+        np.array([row.check for row in first]), index[:, 0], index[:, 1],
+        np.array([seen[point, image] for point, image in index.tolist()]), origin, epsg,
+    )  # fmt: skip
+    points = points.seen_in(np.ones(len(index), dtype=np.bool_))
+    return points if points.names else None
+
+
+def control_notes(dataset: Dataset) -> tuple[str, ...]:
+    """A note on what the file beside the photos holds. Raises InputError ``control_points_invalid``."""
+    files, points = control_files(dataset.root), control_points(dataset)
+    if not files:
+        return ()
+    if points is None:
+        return (f"{files[0].name}: no control point is seen in two photos of the set; it is not used",)
+    checks = int(points.check.sum())
+    return (
+        f"{points.source}: {len(points.names) - checks} control points and {checks} check points in "
+        f"{len(np.unique(points.image))} photos",
+    )
+
+
+def _of_odm(file: Path) -> tuple[list[_Row], bool, int | None]:
+    """OpenDroneMap's: a frame, then x (or longitude), y, z, the pixel, the photo, and perhaps a name."""
+    lines = [(n, line.split()) for n, line in enumerate(read_text(file).splitlines(), 1) if line.strip()]
+    if not lines:
+        raise _invalid(file.name, "is empty.")
+    (header, frame), *told = lines
+    told = [(number, cells) for number, cells in told if not cells[0].startswith("#")]
+    coordinates = [("", *cells) for _, cells in told]
+    degrees, metres, epsg = frame_of(" ".join(frame), coordinates, f"{file.name} line {header}")
+    rows, unknown = [], (math.nan,) * 3
+    for number, cells in told:
+        where = f"{file.name} line {number}"
+        if len(cells) < 6:
+            raise _invalid(where, "has less than x y z px py and an image.")
+        x, y, z, px, py = _numbers(cells[:5], where)
+        name = cells[6] if len(cells) > 6 else " ".join(cells[:3])
+        place = (y, x, z) if degrees else (x * metres, y * metres, z)
+        rows.append(_Row(where, name, name.upper().startswith("CHK"), place, unknown, cells[5], (px, py)))
+    return rows, degrees, epsg
+
+
+def _of_csv(file: Path) -> tuple[list[_Row], bool, int | None]:
+    """A header that names the columns; above it perhaps a line with the frame of x, y, z."""
+    lines = read_text(file).splitlines()
+    epsg = next((int(n) for line in lines[:2] for n in re.findall(r"EPSG:\s*(\d{4,6})", line, re.I)), None)
+    skipped = next((i for i, line in enumerate(lines) if "name" in line.lower()), None)
+    if skipped is None:
+        raise _invalid(file.name, "has no header with a column `name`.")
+    separator = max(",;\t", key=lines[skipped].count)
+    titles = [re.sub(r"[^a-z]", "", cell.lower()) for cell in lines[skipped].split(separator)]
+    titles = [_ALIASES.get(title, title) for title in titles]
+    degrees = "lat" in titles
+    order = ("lat", "lon", "z") if degrees else ("x", "y", "z")
+    if missing := [name for name in order if name not in titles]:
+        raise _invalid(file.name, f"has no column for {', '.join(missing)}.")
+    rows = []
+    for number, cells in enumerate(csv.reader(lines[skipped + 1 :], delimiter=separator), skipped + 2):
+        cell = dict(zip(titles, (text.strip() for text in cells), strict=False))
+        if cell.get("name"):
+            rows.append(_csv_row(cell, order, f"{file.name} line {number}"))
+    return rows, degrees, epsg or (WGS84 if degrees else None)
+
+
+def _csv_row(cell: dict[str, str], order: tuple[str, ...], where: str) -> _Row:
+    a, b, c = _numbers([cell.get(name, "") for name in order], where)
+    across = cell.get("accuracy") or "nan"
+    e, u = _numbers([across, cell.get("zaccuracy") or across], where, finite=False)
+    image, xy = cell.get("image", ""), (math.nan, math.nan)
+    if image:
+        px, py = _numbers([cell.get("px", ""), cell.get("py", "")], where)
+        xy = (px, py)
+    return _Row(
+        where, cell["name"], cell.get("check", "").lower() in _CHECKS, (a, b, c), (e, e, u), image, xy
+    )
+
+
+def _numbers(texts: list[str], where: str, *, finite: bool = True) -> Iterator[float]:
+    try:
+        numbers = [float(text) for text in texts]
+    except ValueError:
+        numbers = []
+    if (
+        not numbers
+        or (finite and not all(map(math.isfinite, numbers)))
+        or any(n <= 0 for n in numbers if not finite)
+    ):
+        raise _invalid(
+            where, f"has {', '.join(texts)[:100]}, which are not {len(texts)} numbers that can be meant."
+        )
+    return iter(numbers)
+
+
+def _invalid(where: str, detail: str) -> InputError:
+    return InputError("control_points_invalid", detail, where=where, hint=_HINT)

@@ -1,0 +1,92 @@
+"""Where cameras see control points, and how far that is from where these were measured."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.model.measured_places import ControlPoints
+from biresnerf.geometry.camera.camera_models import Camera
+from biresnerf.geometry.camera.pixel_rays import pixels_of_points, rays_of_pixels
+from biresnerf.geometry.earth.georeference import THINNEST, NoGeoreference, fit_positions
+from biresnerf.geometry.similarity import Similarity, align_points
+from biresnerf.geometry.triangulation import triangulate
+
+logger = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+
+LEAST_POINTS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class LocatedPoints:
+    """Control and check points as cameras see them.
+
+    Attributes:
+        metres_from_world: the similarity that carries the control points to their coordinates.
+        error_m: [p, 3], where the points are by the cameras less where they were measured, along the axes.
+        error_px: [p], root mean square over a point's photos of how far it appears from its mark.
+    """
+
+    metres_from_world: Similarity
+    error_m: Array
+    error_px: Array
+
+
+def located(points: ControlPoints, world_from_cam: Array, cameras: Sequence[Camera]) -> LocatedPoints:
+    """The points by cameras [n, 4, 4] that have these lenses [n].
+
+    Raises:
+        NoGeoreference: fewer than three control points, or all on a line.
+    """
+    control = ~points.check
+    if control.sum() < LEAST_POINTS:
+        raise NoGeoreference(
+            f"{control.sum()} control points are seen in two photos, and {LEAST_POINTS} are needed"
+        )
+    spread = np.linalg.svd(points.metres[control] - points.metres[control].mean(0), compute_uv=False)
+    if not spread[1] > THINNEST * spread[0]:
+        raise NoGeoreference("the control points lie on a line, about which they leave the turn open")
+    poses, lenses = world_from_cam[points.image], [camera.full() for camera in cameras]
+    rays, seen = np.empty((len(points.image), 3)), np.empty_like(points.xy)
+    for image in np.unique(points.image).tolist():
+        rays[points.image == image] = rays_of_pixels(lenses[image], points.xy[points.image == image])
+    world = np.einsum("mij,mj->mi", poses[:, :3, :3], rays)
+    focal = np.array([(lens.fx * lens.fy) ** 0.5 for lens in lenses])[points.image]
+    xyz = triangulate(poses[:, :3, 3], world, focal, points.point, len(points.names))
+    in_cam = np.einsum("mji,mj->mi", poses[:, :3, :3], xyz[points.point] - poses[:, :3, 3])
+    for image in np.unique(points.image).tolist():
+        seen[points.image == image] = pixels_of_points(lenses[image], in_cam[points.image == image])
+    square = np.bincount(points.point, ((seen - points.xy) ** 2).sum(1)) / np.bincount(points.point)
+    found = align_points(xyz[control], points.metres[control])
+    return LocatedPoints(found, found.apply(xyz) - points.metres, np.sqrt(square))
+
+
+def metres_from_world(
+    dataset: Dataset, world_from_cam: Array, placed: NDArray[np.bool_] | None = None
+) -> Similarity | None:
+    """What carries the set's cameras at poses [n, 4, 4] to measured places: control points, else positions of cameras.
+
+    None where neither tell. Only cameras that are `placed` [n] count.
+    """
+    counted = np.ones(len(dataset), np.bool_) if placed is None else placed
+    if not np.isfinite(world_from_cam[counted]).all():
+        return None
+    lenses = [dataset.camera_of(i) for i in range(len(dataset))]
+    if dataset.control is not None:
+        with suppress(NoGeoreference):
+            return located(dataset.control.of(counted), world_from_cam, lenses).metres_from_world
+    if dataset.positions is not None:
+        priors = dataset.positions.of(counted)
+        try:
+            return fit_positions(world_from_cam[priors.rows], priors.positions_m).metres_from_world
+        except NoGeoreference as reason:
+            logger.info("%s gives no frame: %s", priors.source, reason)
+    return None
