@@ -21,6 +21,7 @@ from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.part_of_set import without_copies, without_photos
 from biresnerf.data.photos.guessed_lens import with_shared_predictions
 from biresnerf.data.photos.images import load_images
+from biresnerf.data.photos.panoramas.cut_panoramas import called_panoramas, cut_panoramas
 from biresnerf.data.photos.video.video_frames import VideoReading
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.data.seeding.seed_poses import seed_poses
@@ -93,7 +94,7 @@ def refine_poses(
     dataset = input if isinstance(input, Dataset) else _read(Path(input), setup)
     dataset = without_copies(without_photos(dataset, setup.options.leave_out), setup.options.fixed)
     dataset = with_shared_predictions(dataset)
-    dataset = _as_meant(dataset, setup.options)
+    dataset = _as_meant(dataset, setup)
     dataset = replace(dataset, positions=position_priors(dataset), control=control_points(dataset))
     scene, origin = _seed(dataset, setup)
     stages = _first_step(scene, origin, setup, observer)
@@ -173,13 +174,22 @@ def _read(path: Path, setup: _Setup) -> Dataset:
     return read_dataset(path, strict=setup.options.bad_frames == "refuse", videos=videos)
 
 
-def _as_meant(dataset: Dataset, options: ResolvedOptions) -> Dataset:
-    """The set with given poses read as the user says, or a warning that they seem to be meant in another way."""
+def _as_meant(dataset: Dataset, setup: _Setup) -> Dataset:
+    """The set with given poses read as the user says, or a warning that they seem to be meant in another way.
+
+    Panoramas are cut into views.
+    """
+    options = setup.options
     dataset = read_as(dataset, options.given_poses)
+    if options.panoramas == "all":
+        dataset = called_panoramas(dataset)
     question = None if options.given_poses else pose_question(dataset)
-    if question is None:
-        return dataset
-    return replace(dataset, warnings=(*dataset.warnings, as_warning(question)))
+    if question is not None:
+        dataset = replace(dataset, warnings=(*dataset.warnings, as_warning(question)))
+    watch = told_before_the_run(setup.monitor.report, setup.monitor.should_stop)
+    return cut_panoramas(
+        dataset, setup.folder.path, lambda done: watch(f"{done} panoramas are cut into views")
+    )
 
 
 def _seed(dataset: Dataset, setup: _Setup) -> tuple[Scene, RunOrigin]:

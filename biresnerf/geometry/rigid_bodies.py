@@ -85,14 +85,23 @@ class RigidBodies:
         """
         if self.fixed.any():
             centres = given[self.fixed][:, :3, 3]
-            spread = np.linalg.norm(given[:, :3, 3] - given[:, :3, 3].mean(0), axis=1).mean()
-            if self.shared or np.linalg.norm(centres - centres[0], axis=1).max() > _APART * spread:
+            if self._keep_scale(given) or _apart(centres, given):
                 return Similarity.identity()
             scale = _scale_about(centres[0], optimised[:, :3, 3], given[:, :3, 3])
             return Similarity(scale, np.eye(3), (1.0 - scale) * centres[0])
-        if self.shared:
+        if self._keep_scale(given):
             return align_robust(optimised, given, with_rotations=True, with_scale=False)
         return None
+
+    def _keep_scale(self, given: NDArray[np.float64]) -> bool:
+        """Whether some body's cameras stand apart: the views of a panorama do not."""
+        return any(_apart(given[group][:, :3, 3], given) for group in self.shared)
+
+
+def _apart(centres: NDArray[np.float64], poses: NDArray[np.float64]) -> bool:
+    """Whether centres [m, 3] of some of the poses [n, 4, 4] differ."""
+    spread = np.linalg.norm(poses[:, :3, 3] - poses[:, :3, 3].mean(0), axis=1).mean()
+    return bool(np.linalg.norm(centres - centres[0], axis=1).max() > _APART * spread)
 
 
 def _scale_about(centre: NDArray[np.float64], a: NDArray[np.float64], b: NDArray[np.float64]) -> float:

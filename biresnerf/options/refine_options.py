@@ -123,6 +123,11 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
     video_frames: Annotated[int, Option("seeding", "Frames of videos", level="usual")] = Field(
         0, ge=0, le=2000, description="Sharp frames to take of videos; 0: 120, or as many as before."
     )
+    panoramas: Annotated[Literal["auto", "all"], Option("seeding", "360° photos")] = Field(
+        "auto",
+        description="Which photos show all directions and are cut into views. auto: those that their metadata or the "
+        "input's format call equirectangular; all: every one that is twice as wide as high and has no given lens.",
+    )
     fixed: Annotated[Names, Option("coarse", "Photos to keep fixed", level="main")] = Field(
         (),
         max_length=10_000,

@@ -7,6 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from biresnerf.data.model.refined_set import REFINED
+from biresnerf.data.photos.panoramas.cut_panoramas import PANORAMA_VIEWS
 from biresnerf.data.seeding.colmap_process import LOG
 from biresnerf.data.show.history import HISTORY
 from biresnerf.data.show.view_file import CONTACT_SHEET, PREVIEW, THUMBNAIL, VIEW
@@ -39,7 +40,8 @@ class OutputFolder:
             raise InputError("output_not_a_folder", "is a file.", where=str(self.path), hint="Name a folder.")
         if not self.path.is_dir() or (self.path / CHECKPOINT).is_file():
             return
-        if not {path.name for path in self.path.iterdir()} - {CHECKPOINT.parent.name, HISTORY, PREVIEW}:
+        before_training = {CHECKPOINT.parent.name, HISTORY, PREVIEW, PANORAMA_VIEWS}
+        if not {path.name for path in self.path.iterdir()} - before_training:
             return  # new, or killed before the first checkpoint
         where = str(self.path)
         if (self.path / REPORT).is_file():
@@ -54,7 +56,7 @@ class OutputFolder:
             return
         written = {one.in_result for one in formats().values()}
         written |= {REPORT, REPORT_HTML, CONFIG, HISTORY, RENDERS, REFINED, THUMBNAIL, VIEW, CONTACT_SHEET}
-        written |= {GEOREFERENCE, LOG, CHECKPOINT.parent.name}
+        written |= {GEOREFERENCE, LOG, CHECKPOINT.parent.name, PANORAMA_VIEWS}
         for name in {Path(file).parts[0] for file in written if file}:
             path = self.path / name
             if path.is_dir():

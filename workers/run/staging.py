@@ -15,6 +15,7 @@ from workers.store.files import FileStore
 
 EXPORTED_FROM = ("poses.json", "colmap/sparse/0/")  # of a result; all other formats can be made from these
 VIDEO_FRAMES = "video_frames/"  # of a result: photos that its dataset holds as a video
+PANORAMA_VIEWS = "panorama_views/"  # of a result: what was cut from its dataset's panoramas
 
 
 async def stage_job(database: Database, files: FileStore, claim: Claim, folder: Path) -> None:
@@ -37,7 +38,8 @@ async def stage_job(database: Database, files: FileStore, claim: Claim, folder: 
         await files.stage(((row["key"], row["path"]) for row in rows), folder / "input")
     if claim.kind == "export" and _needs_photos(claim.options["formats"]):
         found = await _parents_files(database, claim)
-        await files.stage((pair for pair in found if pair[1].startswith(VIDEO_FRAMES)), folder / "input")
+        for kind, place in ((VIDEO_FRAMES, "input"), (PANORAMA_VIEWS, "result")):
+            await files.stage((pair for pair in found if pair[1].startswith(kind)), folder / place)
     await files.stage(_resumed_files(claim), folder / "output")
     (folder / "job.json").write_text(json.dumps(order, indent=1))
 

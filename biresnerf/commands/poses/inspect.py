@@ -48,7 +48,7 @@ def inspect_command(
 
     options, _ = resolve_here(asked)
     dataset = read_dataset(input_path, videos=VideoReading(options.video_frames))
-    missing_names = sorted(set(options.fixed) - {*dataset.names, *dataset.file_names})
+    missing_names = sorted(name for name in set(options.fixed) if not dataset.called(name))
     dataset = without_copies(without_photos(dataset, options.leave_out))
     dataset = read_as(dataset, options.given_poses)
     if pixels:

@@ -21,6 +21,7 @@ KINDS = {
     "phone": "a phone's walk around a table; poses drift, focal length 1 % too long",
     "half": "the same walk as a COLMAP model that lacks half of the images",
     "vase": "a plain vase without background; each pose is turned at random",
+    "panoramas": "360° photos of a walk around the table; each pose is turned at random",
     "turntable": "the same vase turned once before the camera, in uneven steps; without poses, those of --of too",
 }
 _FOCAL_TOO_LONG = 1.01
@@ -56,11 +57,13 @@ class MadeScene:
     help="Use these images and poses, in any format that `refine` reads, as the truth instead of rendering some.",
 )  # fmt: skip
 @click.option("--views", type=click.IntRange(3, 400), default=60, show_default=True, help="Number of images.")
-@click.option("--size", type=click.IntRange(16, 800), default=100, show_default=True, help="Their width, px.")
+@click.option(
+    "--size", type=click.IntRange(16, 2048), default=100, show_default=True, help="Their width, px."
+)
 @click.option(
     "--noise", type=click.FloatRange(0, 1), default=0.15, show_default=True,
-    help="Standard deviation of the pose noise, as in BARF, for dome and vase; for turntable, share by which its steps "
-    "are uneven.",
+    help="Standard deviation of the pose noise, as in BARF, for dome, vase and panoramas; for turntable, share by "
+    "which its steps are uneven.",
 )  # fmt: skip
 @click.option(
     "--camera", type=click.Choice(CAMERAS),
@@ -127,11 +130,18 @@ def make_scene(
 def _made(output: Path, kind: str, views: int, size: int, noise: float, camera: str, seed: int) -> Path:
     """A rendered set with true poses; its transforms.json."""
     from biresnerf.data.synthetic.camera_photos import MAKERS
-    from biresnerf.data.synthetic.captures import write_turntable, write_vase, write_walk
+    from biresnerf.data.synthetic.captures import (
+        write_panoramas,
+        write_turntable,
+        write_vase,
+        write_walk,
+    )
     from biresnerf.data.synthetic.scene import write_synthetic_scene
 
     if kind == "turntable":
         return write_turntable(output, views, size, seed, noise, MAKERS.get(camera))
+    if kind == "panoramas":
+        return write_panoramas(output, views, size, seed)
     write = {"dome": write_synthetic_scene, "vase": write_vase}.get(kind, write_walk)
     return write(output, views, size, seed, MAKERS.get(camera))
 

@@ -148,7 +148,8 @@ def dataset_of(
 def _missing_notes(frames: Sequence[Frame], photos: PosedPhotos, table: str) -> list[str]:
     """Notes on frames without a pose, and on guessed lenses."""
     without = [frame.name for frame in frames if frame.world_from_cam is None]
-    notes = [guess_note(lens.source) for lens in photos.lenses if lens.source != "given"]
+    guesses = (lens.source for lens in photos.lenses if lens.source != "given" and not lens.camera.panorama)
+    notes = [guess_note(source) for source in guesses]
     if without:
         notes.insert(0, f"{len(without)} of {len(frames)} {table} have no pose yet: {few_names(without)}")
     return notes

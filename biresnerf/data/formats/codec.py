@@ -11,6 +11,7 @@ from biresnerf.data.formats.bind_images import bind_images
 from biresnerf.data.formats.parsed_poses import ParsedPoses
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.refined_set import RefinedSet
+from biresnerf.errors import InputError
 from biresnerf.options.formats import Format
 
 
@@ -84,6 +85,19 @@ class Codec:
     count: Callable[[Path], int] | None = None
     write: Writer | None = None
     given_back: Callable[[Dataset], bool] = lambda dataset: False
+
+    def write_set(self, refined: RefinedSet, path: Path, context: WriteContext) -> None:
+        """Write the set. Raises InputError ``export_not_possible`` where the format cannot hold it."""
+        holds = self.format.name == "transforms" or "lenses" in self.format.loses
+        if not holds and any(camera.panorama for camera in refined.cameras):
+            raise InputError(
+                "export_not_possible",
+                "cannot hold panoramas.",
+                where=path.name,
+                hint="transforms.json and formats without lenses can.",
+            )
+        assert self.write is not None, f"{self.format.name} is written"
+        self.write(refined, path, context)
 
     def place_of(self, file: Path) -> Path | None:
         """What is read when the user names ``file``; None where it is not of this format by its name."""

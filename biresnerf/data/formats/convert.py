@@ -92,8 +92,7 @@ def convert(
 
 def _write(flat: RefinedSet, refined: RefinedSet, name: str, folder: Path, context: WriteContext) -> None:
     codec = ALL_CODECS[name]
-    assert codec.write is not None, f"{name} is declared with a place in a set"
-    codec.write(flat if _wants_flat(name) else refined, folder / codec.format.in_set, context)
+    codec.write_set(flat if _wants_flat(name) else refined, folder / codec.format.in_set, context)
 
 
 @contextmanager

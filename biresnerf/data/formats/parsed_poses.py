@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from biresnerf.data.formats.bad_frames import said, tolerate
 from biresnerf.data.model.dataset import IntrinsicsSource, SourceFormat
 from biresnerf.data.photos.image_files import ImageHeader
+from biresnerf.data.photos.panoramas.panorama import panorama_camera
 from biresnerf.data.photos.photo_folders import few_names
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
@@ -29,6 +30,11 @@ class FrameCamera(NamedTuple):
 
 # The lens of an image by its header and name, where the pose file does not give it without them. It fits the header.
 LensOf: TypeAlias = Callable[[ImageHeader, str], FrameCamera]
+
+
+def panorama_lens(header: ImageHeader, name: str) -> FrameCamera:
+    """`LensOf` of panoramas. Raises InputError ``camera_model_unsupported`` for a photo that is no whole one."""
+    return FrameCamera(panorama_camera(header.width, header.height, name))
 
 
 @dataclass(frozen=True, eq=False)

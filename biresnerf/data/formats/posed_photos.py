@@ -8,10 +8,9 @@ from functools import partial
 from pathlib import Path
 
 from biresnerf.data.formats.bad_frames import attempt, good_frames
-from biresnerf.data.formats.parsed_poses import FrameCamera, PoseEntry
+from biresnerf.data.formats.parsed_poses import FrameCamera, PoseEntry, panorama_lens
 from biresnerf.data.photos.guessed_lens import guess_lens, lens_doubts, refuse_other_units
 from biresnerf.data.photos.image_files import ImageHeader, read_header
-from biresnerf.data.photos.kinds.panorama import panorama
 from biresnerf.data.photos.kinds.sixteen_bit import Levels, levels_note, levels_of_set
 from biresnerf.data.photos.orientation import (
     meant_orientations,
@@ -88,15 +87,17 @@ def _sound_camera(entry: PoseEntry, header: ImageHeader) -> FrameCamera:
         InputError: ``camera_model_unsupported``, ``intrinsics_invalid``, or a code of `_camera_of`.
     """
     found = _camera_of(entry, header)
+    if found.camera.panorama:
+        return found
     # Views that were cut from a panorama may still say that they are one: they are no 2 : 1, or have a lens.
     if header.equirectangular and (found.source != "given" or header.width == 2 * header.height):
-        raise panorama("its metadata say that it is equirectangular", entry.name)
+        return panorama_lens(header, entry.name)._replace(source="exif")
     if found.source != "given":
         if header.width != 2 * header.height:
             return found
         note = (
-            "photos of twice their height in width may be panoramas, which are not supported: they are taken for "
-            "perspective ones"
+            "photos twice as wide as high may be panoramas, and are taken for perspective ones: if they are, set "
+            "panoramas=all"
         )
         return found._replace(notes=(*found.notes, note))
     refuse_other_units(found.camera, entry.where)

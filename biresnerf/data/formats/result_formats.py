@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 from biresnerf.data.formats.codec import WriteContext
@@ -10,9 +11,11 @@ from biresnerf.data.formats.colmap.format import COLMAP
 from biresnerf.data.formats.colmap.read_model import read_colmap_model
 from biresnerf.data.formats.registry import ALL_CODECS
 from biresnerf.data.formats.simple.poses_json import POSES, PoseImage, matrix_of, read_poses_json
+from biresnerf.data.formats.transforms.write_transforms import TRANSFORMS
 from biresnerf.data.formats.write_each import write_each
 from biresnerf.data.model.dataset import Dataset
-from biresnerf.data.model.refined_set import RefinedImage, RefinedSet
+from biresnerf.data.model.refined_set import RefinedImage, RefinedSet, of_whole
+from biresnerf.data.photos.panoramas.cut_panoramas import PANORAMA_VIEWS
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS
 from biresnerf.geometry.similarity import Similarity
@@ -65,9 +68,13 @@ def write_exports(
 
 
 def _write(refined: RefinedSet, folder: Path, name: str, context: WriteContext) -> None:
-    codec = ALL_CODECS[name]
-    assert codec.write is not None, f"{name} has a place in results"
-    codec.write(refined, folder / codec.format.in_result, context)
+    codec, dataset = ALL_CODECS[name], context.dataset
+    if dataset is not None and (name == TRANSFORMS.name or codec.given_back(dataset)):
+        # These are of the input's own images; the others show what was cut from its panoramas.
+        whole = of_whole(dataset, refined.world_from_cam, refined.similarity)
+        if whole is not None:
+            context, refined = replace(context, dataset=whole[0]), whole[1]
+    codec.write_set(refined, folder / codec.format.in_result, context)
 
 
 def formats_given_back(dataset: Dataset) -> tuple[str, ...]:
@@ -107,7 +114,7 @@ def read_result(folder: Path, photos: Path | None = None) -> RefinedSet:
             raise _inconsistent(folder, camera.model)
     return RefinedSet(
         document.cameras,
-        tuple(_image(image, photos) for image in document.images),
+        tuple(_image(image, photos, folder) for image in document.images),
         model,
         tuple(image_ids),
         document.points_source,
@@ -116,8 +123,10 @@ def read_result(folder: Path, photos: Path | None = None) -> RefinedSet:
     )
 
 
-def _image(image: PoseImage, photos: Path | None) -> RefinedImage:
+def _image(image: PoseImage, photos: Path | None, result: Path) -> RefinedImage:
     path = None if photos is None else photos / image.file_name
+    if path is not None and image.file_name.startswith(f"{PANORAMA_VIEWS}/"):
+        path = result / image.file_name
     if path is not None and not path.is_file():
         raise InputError(
             "image_missing",

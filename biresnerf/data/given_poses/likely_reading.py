@@ -28,6 +28,8 @@ def pose_question(dataset: Dataset) -> PoseQuestion | None:
     Raises:
         InputError: as `load_images` does.
     """
+    if any(camera.panorama for camera in dataset.cameras):  # whose details lie in all directions
+        return None
     return borne_out(dataset, matched_pairs(dataset))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -96,6 +97,7 @@ class Dataset:
         body_offset: what all given poses lacked, and have now; None where nothing was found.
         positions: where the photos were taken, once that was asked; None where nothing says so.
         control: points on the ground that were measured, once that was asked; None where there are none.
+        cut: where frames are views of panoramas; None where there are none.
     """
 
     root: Path
@@ -108,6 +110,7 @@ class Dataset:
     body_offset: BodyOffset | None = None
     positions: PositionPriors | None = None
     control: ControlPoints | None = None
+    cut: Cut | None = None
 
     def __post_init__(self) -> None:
         if all(by == "given" for by in self.intrinsics_sources):
@@ -125,6 +128,21 @@ class Dataset:
     def file_names(self) -> tuple[str, ...]:
         """The images' paths relative to ``root``, with extension and forward slashes (COLMAP's names)."""
         return tuple(Path(os.path.relpath(frame.path, self.root)).as_posix() for frame in self.frames)
+
+    def called(self, name: str) -> list[int]:
+        """The frames that the user calls so: by the input's name or by the path relative to its root.
+
+        These are all views of a panorama that is called so. Empty where there is no such image.
+        """
+        if name in self._row_of:
+            return [self._row_of[name]]
+        if self.cut is None:
+            return []
+        return np.flatnonzero(np.isin(self.cut.rows, self.cut.whole.called(name))).tolist()
+
+    @cached_property
+    def _row_of(self) -> dict[str, int]:
+        return {name: i for names in (self.file_names, self.names) for i, name in enumerate(names)}
 
     @property
     def posed(self) -> NDArray[np.bool_]:
@@ -155,3 +173,41 @@ class Dataset:
     def source_of_intrinsics(self, camera: int) -> IntrinsicsSource:
         """Who found the intrinsics of camera ``camera``."""
         return self.intrinsics_sources[camera] if self.intrinsics_sources else "given"
+
+
+@dataclass(frozen=True, eq=False)
+class Cut:
+    """What a set was before its panoramas were cut into views.
+
+    Attributes:
+        whole: the set with its panoramas.
+        rows: int64 [n], the frame of ``whole`` that each frame shows a part, or all, of.
+        cam_from_whole: float64 [n, 4, 4], from that one's axes to the frame's; a rotation.
+    """
+
+    whole: Dataset
+    rows: NDArray[np.int64]
+    cam_from_whole: NDArray[np.float64]
+
+    @property
+    def firsts(self) -> NDArray[np.int64]:
+        """Of each frame of ``whole``, int64 [m], the first of the frames that show it."""
+        return np.unique(self.rows, return_index=True)[1]
+
+    def poses_of_whole(self, world_from_cam: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Poses [m, 4, 4] of the frames of ``whole``, from those [n, 4, 4] of all frames."""
+        poses = world_from_cam @ self.cam_from_whole
+        # Where nothing moved, the very numbers that were given.
+        return np.stack(
+            [
+                given
+                if (given := frame.world_from_cam) is not None
+                and np.array_equal(given @ self.cam_from_whole[first].T, world_from_cam[first])
+                else poses[first]
+                for frame, first in zip(self.whole.frames, self.firsts, strict=True)
+            ]
+        )
+
+    def poses_of_views(self, world_from_whole: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Poses [n, 4, 4] of the frames from those [m, 4, 4] of the frames of ``whole``."""
+        return world_from_whole[self.rows] @ self.cam_from_whole.swapaxes(1, 2)

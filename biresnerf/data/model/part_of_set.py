@@ -25,7 +25,7 @@ def without_photos(dataset: Dataset, names: Sequence[str]) -> Dataset:
     """
     if not names:
         return dataset
-    row_of = {name: i for known in (dataset.file_names, dataset.names) for i, name in enumerate(known)}
+    row_of = {name: rows[0] for name in names if (rows := dataset.called(name))}
     unknown = [name for name in names if name not in row_of]
     if unknown:
         raise InputError(

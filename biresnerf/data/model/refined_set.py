@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from biresnerf.data.model.colmap_scene import ColmapModel, no_points
 from biresnerf.data.model.dataset import Dataset
-from biresnerf.data.model.result_model import model_at_poses, model_of_poses, with_points
+from biresnerf.data.model.result_model import model_at_poses, model_of_poses, with_points, with_rigs
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.geometry.similarity import Similarity
@@ -159,6 +159,25 @@ def refined_set(
     )
 
 
+def of_whole(
+    dataset: Dataset, world_from_cam: NDArray[np.float64], similarity: Similarity
+) -> tuple[Dataset, RefinedSet] | None:
+    """The set as it was before panoramas were cut, and that at the poses [n, 4, 4] of the views; None without any.
+
+    Photos that are no panoramas have the lenses of ``dataset``.
+    """
+    if dataset.cut is None:
+        return None
+    whole = dataset.cut.whole
+    cameras = list(whole.cameras)
+    for frame, row in zip(dataset.frames, dataset.cut.rows, strict=True):
+        lens = whole.frames[row].camera
+        if not cameras[lens].panorama:
+            cameras[lens] = dataset.cameras[frame.camera]
+    whole = replace(whole, cameras=tuple(cameras))
+    return whole, refined_set(whole, dataset.cut.poses_of_whole(world_from_cam), similarity=similarity)
+
+
 def _model(
     dataset: Dataset, before: Sequence[NDArray[np.float64] | None], world_from_cam: NDArray[np.float64]
 ) -> tuple[ColmapModel, tuple[int, ...]]:
@@ -167,6 +186,9 @@ def _model(
     given = dataset.source.colmap
     if given is None:
         made = model_of_poses(dataset.file_names, dataset.cameras, indices, world_from_cam)
+        if dataset.cut is not None:
+            rigs = [dataset.cut.whole.frames[row].camera for row in dataset.cut.rows]
+            made = with_rigs(made, rigs, dataset.cut.rows, dataset.cut.cam_from_whole)
         return made, tuple(range(1, len(dataset) + 1))
     as_read = dataset.body_offset is None
     changed = np.array(

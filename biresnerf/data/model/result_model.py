@@ -33,6 +33,41 @@ def model_of_poses(
     )
 
 
+def with_rigs(
+    model: colmap.ColmapModel,
+    rigs: Sequence[int],
+    moments: NDArray[np.int64],
+    cam_from_rig: NDArray[np.float64],
+) -> colmap.ColmapModel:
+    """A model of `model_of_poses` as rigs.
+
+    Args:
+        rigs: of each image, the number of its rig.
+        moments: of each image, int64 [n]: those of one number were taken at once.
+        cam_from_rig: of each image's camera, float64 [n, 4, 4].
+    """
+    sensors: dict[int, dict[colmap.Sensor, NDArray[np.float64]]] = {}
+    frames: dict[int, tuple[int, list[tuple[colmap.Sensor, int]]]] = {}
+    for image, rig, moment, pose in zip(
+        model.images.values(), rigs, moments.tolist(), cam_from_rig, strict=True
+    ):
+        sensor: colmap.Sensor = ("CAMERA", image.camera_id)
+        sensors.setdefault(rig, {})[sensor] = pose
+        frames.setdefault(moment, (rig, []))[1].append((sensor, image.id))
+    made = {}
+    for rig, ((first, reference), *others) in ((rig, [*found.items()]) for rig, found in sensors.items()):
+        known: dict[colmap.Sensor, colmap.RigidPose | None] = {
+            one: colmap.rigid_pose_of(pose @ rigid_inverse(reference)) for one, pose in others
+        }
+        made[rig + 1] = colmap.ColmapRig(rig + 1, first, known)
+    placed = {}
+    for moment, (rig, taken) in frames.items():
+        rig_from_world = _rig_from_world(made[rig + 1], taken, model.images)
+        assert rig_from_world is not None, "every sensor's place in its rig is known"
+        placed[moment + 1] = colmap.ColmapFrame(moment + 1, rig + 1, rig_from_world, tuple(taken))
+    return replace(model, rigs=made, frames=placed)
+
+
 def model_at_poses(
     given: colmap.ColmapModel,
     names: Sequence[str],

@@ -15,7 +15,6 @@ from PIL import Image
 from PIL.TiffImagePlugin import TiffImageFile
 
 from biresnerf.data.photos.kinds import linear_light, raw_file
-from biresnerf.data.photos.kinds.panorama import says_equirectangular
 from biresnerf.data.photos.kinds.photo_kinds import (
     HEIC,
     PLAIN_SUFFIXES,
@@ -24,6 +23,7 @@ from biresnerf.data.photos.kinds.photo_kinds import (
     install_hint,
     is_readable,
 )
+from biresnerf.data.photos.panoramas.panorama import says_equirectangular
 from biresnerf.errors import InputError
 
 # What COLMAP and other programs read, too; the others are decoded for them.

@@ -60,6 +60,7 @@ def map_images(request: dict[str, Any]) -> dict[str, Any]:
     count = sum(len(camera["names"]) for camera in request["cameras"])
     pycolmap.set_random_seed(request["seed"])
     numbers = extract_features(request, database, images, extraction_options(request))
+    tie_rigs(database, request["rigs"])
     say(f"features of {count} images found")
     match_features(request, database, work)
     if still := leave_out_still(request, database):
@@ -141,6 +142,43 @@ def extract_features(request: dict[str, Any], database: Path, images: Path, extr
     return [camera_of.get(name, -1) for name in firsts]
 
 
+def tie_rigs(database_path: Path, rigs: list[list[list[tuple[str, list[list[float]]]]]]) -> None:
+    """Ties photos taken at once, from one centre, into frames of rigs.
+
+    A rig is a list of moments, each a list of photos with their rotations [3, 3] from the rig.
+    """
+    import numpy as np
+    import pycolmap
+
+    if not rigs:
+        return
+    with pycolmap.Database.open(database_path) as database:
+        images = {image.name: image for image in database.read_all_images()}
+        tied = {name for rig in rigs for moment in rig for name, _ in moment}
+        single = [[[(name, np.eye(3).tolist())]] for name in images if name not in tied]
+        database.clear_frames()
+        database.clear_rigs()
+        written: dict[int, int] = {}  # by the first camera
+        for moments in [*rigs, *single]:
+            turns = {
+                images[name].data_id.sensor_id: np.array(turn) for moment in moments for name, turn in moment
+            }
+            (first, reference), *others = turns.items()
+            if first.id not in written:
+                rig = pycolmap.Rig()
+                rig.add_ref_sensor(first)
+                for sensor, turn in others:
+                    rotation = pycolmap.Rotation3d(turn @ reference.T)
+                    rig.add_sensor(sensor, pycolmap.Rigid3d(rotation, np.zeros(3)))
+                written[first.id] = database.write_rig(rig)
+            for moment in moments:
+                frame = pycolmap.Frame()
+                frame.rig_id = written[first.id]
+                for name, _ in moment:
+                    frame.add_data_id(images[name].data_id)
+                database.write_frame(frame)
+
+
 def map_incrementally(
     database: Path, images: Path, work: Path, request: dict[str, Any], numbers: list[int]
 ) -> dict[int, Any]:
@@ -154,6 +192,7 @@ def map_incrementally(
     options.min_model_size, options.min_num_matches = 3, 10
     options.ba_refine_focal_length = options.ba_refine_extra_params = len(known) < len(numbers)
     options.constant_cameras = set(known)
+    options.ba_refine_sensor_from_rig = False
     guided = len(request["cam_from_world"]) >= 3
     options.use_prior_position = options.use_robust_loss_on_prior_position = guided
     if request["likeliest"] is not None:  # all cameras are adjusted again at the end of a run
@@ -180,7 +219,7 @@ def map_globally(
     fixed = all(camera["known"] for camera in request["cameras"])
     adjustment = options.mapper.bundle_adjustment
     adjustment.refine_focal_length = adjustment.refine_extra_params = not fixed
-    adjustment.refine_principal_point = False
+    adjustment.refine_principal_point = adjustment.refine_sensor_from_rig = False
     return pycolmap.global_mapping(database, images, work, options)
 
 

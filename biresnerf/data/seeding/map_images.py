@@ -166,6 +166,20 @@ def _numbered(dataset: Dataset) -> list[str]:
     return [f"{i:06}{suffix}" for i, suffix in enumerate(suffixes)]
 
 
+def _rigs(dataset: Dataset, names: list[str]) -> list[list[list[tuple[str, list[list[float]]]]]]:
+    """Of the panoramas of each size, each one's views: names, and rotations [3, 3] to them from the panorama."""
+    if dataset.cut is None:
+        return []
+    cut = dataset.cut
+    views = [(name, turn[:3, :3].tolist()) for name, turn in zip(names, cut.cam_from_whole, strict=True)]
+    rigs: dict[int, list[list[tuple[str, list[list[float]]]]]] = {}
+    for row, frame in enumerate(cut.whole.frames):
+        if cut.whole.cameras[frame.camera].panorama:
+            moment = [views[i] for i in np.flatnonzero(cut.rows == row)]
+            rigs.setdefault(frame.camera, []).append(moment)
+    return list(rigs.values())
+
+
 def _as_it_is(dataset: Dataset, index: int) -> bool:
     """Whether COLMAP takes the file itself: it reads plain photos, and takes their pixels as they are stored."""
     frame = dataset.frames[index]
@@ -209,6 +223,7 @@ def _request_images(dataset: Dataset, names: list[str]) -> dict[str, Any]:
         "cam_from_world": dict(zip(posed_names, np.linalg.inv(given).tolist(), strict=False)),
         "position_deviation": POSITION_DEVIATION * focus_point(given).mean_distance,
         "pairs": _pairs(dataset, names),
+        "rigs": _rigs(dataset, names),
     }
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.model.dataset import GUESSES, Dataset
+from biresnerf.data.model.dataset import GUESSES, Cut, Dataset
 from biresnerf.data.photos.image_likeness import likeness
 from biresnerf.data.photos.named_images import MIN_IMAGES
 from biresnerf.data.photos.orientation import shown_from_cam
@@ -289,7 +289,16 @@ def _facing_forward(given: _Given, what: str) -> Seeding:
     return _seeding(noted, _without_features(given))
 
 
+def _as_rigs(candidate: InitialPoses, cut: Cut) -> InitialPoses:
+    """All views of a panorama at its place, as its first view has it: guesses are made of each view by itself."""
+    poses = cut.poses_of_views((candidate.world_from_cam @ cut.cam_from_whole)[cut.firsts])
+    sources = tuple(candidate.sources[cut.firsts[row]] for row in cut.rows)
+    return replace(candidate, world_from_cam=poses, sources=sources)
+
+
 def _seeding(dataset: Dataset, *candidates: InitialPoses) -> Seeding:
+    if dataset.cut is not None:
+        candidates = tuple(_as_rigs(candidate, dataset.cut) for candidate in candidates)
     first = candidates[0]
     frames = tuple(
         replace(frame, world_from_cam=pose, pose_source=source) if frame.world_from_cam is None else frame

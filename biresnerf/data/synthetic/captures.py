@@ -17,13 +17,16 @@ from biresnerf.data.synthetic.scene import (
     MADE_SCENE,
     SHAPES,
     random_textures,
+    render_panorama,
     render_shapes,
     synthetic_cameras,
     synthetic_focal,
     write_blender_set,
 )
 from biresnerf.data.synthetic.shapes import Shape, Texture
+from biresnerf.geometry.camera.camera_models import PANORAMA
 from biresnerf.geometry.level_ring import level_ring
+from biresnerf.geometry.rigid import rotation_of
 
 # The objects of the scene stand on a table in a room, which fills the photos.
 TABLE_SCENE = (
@@ -48,6 +51,12 @@ PHONE_FOCAL_OF_WIDTH = 0.77
 PHONE_FROM_SCENE = np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, -1.0, 0, 0], [0, 0, 0, 1.0]])
 TABLE_METRES = 0.35
 _TABLE_ELEVATION_RAD = 0.42
+_TILT_RAD = 0.05
+_GPANO = (
+    b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+    b'<rdf:Description rdf:about="" xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" '
+    b'GPano:ProjectionType="equirectangular"/></rdf:RDF></x:xmpmeta>'
+)
 _WALK_TURNS, _WALK_DISTANCE, _WALK_ELEVATION_RAD = 1.2, 3.3, (0.42, 0.75)
 
 
@@ -124,6 +133,35 @@ def write_walk(folder: Path, n_views: int, width: int, seed: int, maker: Maker |
     return path
 
 
+def write_panoramas(folder: Path, n_views: int, width: int, seed: int) -> Path:
+    """Writes panoramas (JPEG, named so by their XMP) of a walk around the table, and nerfstudio's transforms.json.
+
+    The camera is held upright to a few degrees and turned anyhow; poses are the true ones.
+
+    Returns:
+        the path of transforms.json.
+    """
+    rng = np.random.default_rng([seed, 11])
+    poses = walking_cameras(n_views, seed)
+    upright = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])  # looking along y
+    turns = np.stack([np.zeros(n_views), np.zeros(n_views), rng.uniform(0, 2 * np.pi, n_views)], axis=1)
+    tilts = rng.normal(0, _TILT_RAD, (n_views, 3))
+    poses[:, :3, :3] = _rotations(turns) @ upright @ _rotations(tilts)
+    textures = table_textures(seed)
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    for index, pose in enumerate(poses):
+        picture = render_panorama(TABLE_SCENE, textures, pose, width)
+        Image.fromarray(picture).save(folder / "images" / f"{index:03}.jpg", quality=95, xmp=_GPANO)
+    frames = [
+        {"file_path": f"images/{index:03}.jpg", "transform_matrix": matrix.tolist()}
+        for index, matrix in enumerate(file_from_world_from_cam(poses, np.eye(4), 1.0))
+    ]
+    path = folder / "transforms.json"
+    size = {"camera_model": PANORAMA, "w": width, "h": width // 2}
+    write_json(path, {**size, MADE_SCENE: "table", "frames": frames}, indent=1)
+    return path
+
+
 def write_vase(folder: Path, n_views: int, size: int, seed: int, maker: Maker | None = None) -> Path:
     """Writes square cut-out views of the vase and transforms.json (Blender dialect, true poses); returns its path."""
     return _write_vase(folder, synthetic_cameras(n_views, seed), size, seed, maker)
@@ -157,3 +195,7 @@ def _write_vase(folder: Path, poses: NDArray[np.float64], size: int, seed: int, 
     focal = synthetic_focal(size)
     pictures = (render_shapes(VASE, textures, pose, size, size, focal)[0] for pose in poses)
     return write_blender_set(folder, poses, pictures, "vase", maker)
+
+
+def _rotations(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.stack([rotation_of(vector) for vector in vectors])

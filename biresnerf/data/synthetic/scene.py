@@ -104,6 +104,26 @@ def render_shapes(
     return np.rint(255.0 * rgba).astype(np.uint8), depth.astype(np.float32)
 
 
+def render_panorama(
+    shapes: Sequence[Shape], textures: Sequence[Texture], world_from_cam: NDArray[np.float64], width: int
+) -> NDArray[np.uint8]:
+    """All directions from a pose [4, 4], equirectangular, forward in the middle: uint8 [width / 2, width, 3].
+
+    Each pixel is the mean of 4 rays; black where there is nothing.
+    """
+    origin = world_from_cam[:3, 3].astype(np.float32)
+    east = ((np.arange(2 * width) + 0.5) / width - 1) * np.pi
+    rows = []
+    for row in range(width // 2):
+        down = ((2 * row + np.array([[0.5], [1.5]])) / width - 0.5) * np.pi
+        level = np.cos(down)
+        x, y, z = np.broadcast_arrays(level * np.sin(east), np.sin(down), level * np.cos(east))
+        directions = np.stack([x, y, z], axis=-1).reshape(-1, 3) @ world_from_cam[:3, :3].T
+        colour = _trace(shapes, textures, origin, directions.astype(np.float32))[0]
+        rows.append(colour.reshape(2, width, 2, 3).mean(axis=(0, 2)))
+    return np.rint(255.0 * np.stack(rows)).clip(0, 255).astype(np.uint8)
+
+
 def _trace(
     shapes: Sequence[Shape],
     textures: Sequence[Texture],

@@ -36,6 +36,9 @@ MODEL_PARAMETERS: dict[str, tuple[str, ...]] = {
     "FISHEYE": ("fx", "fy", "cx", "cy"),
 }
 MODEL_IDS = {name: number for number, name in enumerate(COLMAP_MODELS) if name in MODEL_PARAMETERS}
+# Of a photo that shows all directions, twice as wide as high; it has no parameters. It is cut into views before use
+# (`biresnerf.data.photos.panoramas.cut_panoramas`), so nothing that projects knows it.
+PANORAMA = "EQUIRECTANGULAR"
 FISHEYE_MODELS = frozenset(name for name in MODEL_PARAMETERS if name.endswith("FISHEYE"))
 # If the requested model cannot represent a camera, the first of these that can is used; those of one focal length where
 # the requested one has one.
@@ -133,6 +136,11 @@ class Camera:
     params: tuple[float, ...]
     shear: float = 0.0
 
+    @property
+    def panorama(self) -> bool:
+        """Whether it is none with a lens: the photo shows all directions, forward in its middle."""
+        return self.model == PANORAMA
+
     def full(self) -> FullParameters:
         """These intrinsics with all coefficients written out, and whether they are a fisheye's."""
         return full_parameters(self.model, self.params)
@@ -142,6 +150,8 @@ class Camera:
 
         The true ratios are used, so a model with one focal length may have to become one with two.
         """
+        if self.panorama:
+            return Camera(PANORAMA, width, height, ())
         a, b = width / self.width, height / self.height
         p = self.full()
         scaled = p._replace(fx=p.fx * a, fy=p.fy * b, cx=p.cx * a, cy=p.cy * b)

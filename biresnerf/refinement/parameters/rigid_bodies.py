@@ -31,8 +31,8 @@ def rigid_bodies(dataset: Dataset, options: ResolvedOptions) -> RigidBodies:
 
 
 def _fixed_rows(dataset: Dataset, fixed: Sequence[str]) -> list[int]:
-    row_of = {name: i for names in (dataset.file_names, dataset.names) for i, name in enumerate(names)}
-    missing = [name for name in fixed if name not in row_of]
+    rows_of = {name: dataset.called(name) for name in fixed}
+    missing = [name for name in fixed if not rows_of[name]]
     if missing:
         raise InputError(
             "fixed_not_found",
@@ -40,20 +40,22 @@ def _fixed_rows(dataset: Dataset, fixed: Sequence[str]) -> list[int]:
             where="fixed",
             hint="Name images as the input does, or by their path relative to its folder.",
         )
-    rows = [row_of[name] for name in fixed]
-    for row, name in zip(rows, fixed, strict=True):
-        if dataset.frames[row].pose_source != "given":
+    for name, rows in rows_of.items():
+        if dataset.frames[rows[0]].pose_source != "given":
             raise InputError(
                 "fixed_without_pose",
                 f"{name!r} is to stay fixed, but the input has no pose for it.",
                 where="fixed",
                 hint="Give its pose, or leave it out of fixed.",
             )
-    return rows
+    return [row for rows in rows_of.values() for row in rows]
 
 
 def _moments(dataset: Dataset) -> list[list[int]]:
-    """Rows of the images that one frame of a COLMAP rig took, where there are several."""
+    """Rows of the images that one frame of a COLMAP rig took, or that were cut from one panorama; where several."""
+    if dataset.cut is not None:
+        groups = (np.flatnonzero(dataset.cut.rows == row).tolist() for row in range(len(dataset.cut.whole)))
+        return [group for group in groups if len(group) > 1]
     model = dataset.source.colmap
     if model is None:
         return []

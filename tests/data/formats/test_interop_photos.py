@@ -22,6 +22,7 @@ if not CASES.is_dir():
 READ = {
     "30_unpadded_numbers/kitti": (12, 12, "as numbers (frame_2.jpg before frame_10.jpg)"),
     "30_unpadded_numbers/log": (12, 12, "as numbers (2.jpg before 10.jpg)"),
+    "32_panoramas_taken_as_perspective/metashape_spherical": (8, 8, None),
     "34_times_of_photos/ns_names": (12, 10, "by time (by the images' names"),
     "34_times_of_photos/prefixed": (12, 10, "by time (by the images' names"),
     "35_geo_txt/epsg_4258": (8, 8, "measured positions of 8 of 8"),
@@ -36,8 +37,6 @@ READ = {
     "46_png_beside_jpg/set": (6, 6, "0001.jpg (not 0001.png)"),
 }
 REFUSED = {
-    "32_panoramas_taken_as_perspective/metashape_spherical": ("camera_model_unsupported", "spherical"),
-    "32_panoramas_taken_as_perspective/photos": ("camera_model_unsupported", "equirectangular"),
     "33_focal_in_other_units/normalised": ("intrinsics_invalid", "looks like a share of the photo's width"),
     "45_unread_kinds_in_images/jp2": ("no_images", "4 JPEG 2000 (images/0001.jp2"),
 }

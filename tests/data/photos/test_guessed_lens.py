@@ -136,32 +136,38 @@ GPANO = XMP.format('GPano:ProjectionType="equirectangular"').encode()
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".webp", ".tif", ".png"])
-def test_panoramas_are_refused_and_what_to_do_with_them_is_said(tmp_path, suffix):
+def test_panoramas_are_known_by_their_metadata(tmp_path, suffix):
     text = PngInfo()
     text.add_itxt("XML:com.adobe.xmp", GPANO.decode())
     told = {".tif": {"tiffinfo": {700: GPANO}}, ".png": {"pnginfo": text}}.get(suffix, {"xmp": GPANO})
     for number in range(4):
         Image.new("RGB", (80, 40), (number, 9, 9)).save(tmp_path / f"{number}{suffix}", **told)
+    assert [camera.model for camera in read_dataset(tmp_path).cameras] == ["EQUIRECTANGULAR"]
+
+
+def test_a_part_of_a_panorama_is_refused(tmp_path):
+    for number in range(4):
+        Image.new("RGB", (90, 40), (number, 9, 9)).save(tmp_path / f"{number}.jpg", xmp=GPANO)
     with pytest.raises(InputError) as caught:
         read_dataset(tmp_path)
-    assert_complete(caught.value, "camera_model_unsupported", f"0{suffix}")
-    assert "perspective views" in caught.value.hint
+    assert_complete(caught.value, "camera_model_unsupported", "0.jpg")
+    assert "360 by 180 degrees" in caught.value.hint
 
 
 def test_photos_of_a_panoramas_shape_are_said(tmp_path):
     for number in range(3):
         Image.new("RGB", (80, 40), (number, 9, 9)).save(tmp_path / f"{number}.jpg")
-    assert any("may be panoramas" in text for text in read_dataset(tmp_path).warnings)
+    assert any("panoramas=all" in text for text in read_dataset(tmp_path).warnings)
 
 
-def test_one_panorama_among_photos_is_left_out(tmp_path):
+def test_a_part_of_a_panorama_among_photos_is_left_out(tmp_path):
     for number in range(4):
-        Image.new("RGB", (80, 40), (number, 9, 9)).save(
+        Image.new("RGB", (90, 40), (number, 9, 9)).save(
             tmp_path / f"{number}.jpg", xmp=GPANO if number == 1 else b""
         )
     dataset = read_dataset(tmp_path)
     assert dataset.names == ("0.jpg", "2.jpg", "3.jpg")
-    assert any("1.jpg" in text and "equirectangular" in text for text in dataset.warnings)
+    assert any("1.jpg" in text and "no whole panorama" in text for text in dataset.warnings)
 
 
 def test_views_cut_from_a_panorama_that_kept_its_metadata_are_read_with_their_lens(tmp_path):

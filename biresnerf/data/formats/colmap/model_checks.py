@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from biresnerf.data.model import colmap_scene as colmap
 from biresnerf.data.model.pose_validation import MAX_COORDINATE, MAX_POINT_COORDINATE
-from biresnerf.data.photos.kinds.panorama import panorama
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import COLMAP_MODELS, MODEL_IDS, MODEL_PARAMETERS, Camera
 from biresnerf.geometry.camera.lens import lens_problem
@@ -60,8 +59,6 @@ def model_name_of_id(model_id: int, where: str) -> str:
 
 def supported_model(name: str, where: str) -> str:
     """``name`` itself. Raises InputError ``camera_model_unsupported``."""
-    if name == "EQUIRECTANGULAR":
-        raise panorama(f"the camera model is {name}", where)
     if name not in MODEL_IDS:
         raise InputError(
             "camera_model_unsupported",

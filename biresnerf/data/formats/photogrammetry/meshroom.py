@@ -30,7 +30,7 @@ from biresnerf.data.formats.pose_rows import folder_with_photos, lens_of
 from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.model.untrusted_file import checked, invalid_file, read_json_object
-from biresnerf.data.photos.kinds.panorama import panorama
+from biresnerf.data.photos.panoramas.panorama import panorama_camera
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera, FullParameters
 from biresnerf.options.formats import Format
@@ -142,7 +142,7 @@ def _read_lens(row: dict[str, Any], where: str, version: tuple[int, ...]) -> Cam
     kind = (lens.type if version < (1, 2, 8) or lens.type != "pinhole" else lens.distortionType).lower()
     names = _LENSES.get(kind)
     if kind == "equirectangular":
-        raise panorama(f"the lens is {kind}", where)
+        return panorama_camera(lens.width, lens.height, where)
     if names is None or lens.undistortionType != "none":
         raise InputError(
             "camera_model_unsupported",

@@ -26,7 +26,7 @@ from biresnerf.data.formats.pose_rows import Placed, entry_of, shear_of, without
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.untrusted_file import finite_numbers, invalid_file
-from biresnerf.data.photos.kinds.panorama import panorama
+from biresnerf.data.photos.panoramas.panorama import panorama_camera
 from biresnerf.data.photos.photo_folders import few_names
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
@@ -155,8 +155,8 @@ def _camera(sensor: ElementTree.Element | None, where: str) -> Camera | None:
     adjusted = [one for one in found if one.get("class") == "adjusted"]
     calibration = next(iter(adjusted or found), None)
     kind = (None if calibration is None else calibration.get("type")) or sensor.get("type") or "frame"
-    if kind in ("spherical", "cylindrical"):
-        raise panorama(f"the camera type is {kind}", where)
+    if kind == "spherical":
+        return panorama_camera(*_resolution(sensor, calibration, where), where)
     if kind != "frame":
         raise InputError(
             "camera_model_unsupported",
@@ -178,15 +178,21 @@ def _camera(sensor: ElementTree.Element | None, where: str) -> Camera | None:
             where=where,
             hint="Optimise the cameras without it and export again, or export undistorted images.",
         )
-    resolution = calibration.find("resolution")
+    width, height = _resolution(sensor, calibration, where)
+    shear = shear_of(values["b2"], values["f"] or values["fy"], where)
+    return without_skew(_colmap_camera(values, width, height, where), shear, where)
+
+
+def _resolution(
+    sensor: ElementTree.Element, calibration: ElementTree.Element | None, where: str
+) -> tuple[int, int]:
+    resolution = None if calibration is None else calibration.find("resolution")
     resolution = sensor.find("resolution") if resolution is None else resolution
     size = {} if resolution is None else resolution.attrib
     try:
-        width, height = int(size["width"]), int(size["height"])
+        return int(size["width"]), int(size["height"])
     except (KeyError, ValueError):
         raise invalid_file(where, "has no resolution of whole width and height.", _HINT) from None
-    shear = shear_of(values["b2"], values["f"] or values["fy"], where)
-    return without_skew(_colmap_camera(values, width, height, where), shear, where)
 
 
 def _colmap_camera(values: dict[str, float], width: int, height: int, where: str) -> Camera:

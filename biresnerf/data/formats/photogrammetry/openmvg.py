@@ -27,7 +27,7 @@ from biresnerf.data.formats.pose_rows import folder_with_photos, lens_of
 from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.model.untrusted_file import checked, invalid_file, read_json_object
-from biresnerf.data.photos.kinds.panorama import panorama
+from biresnerf.data.photos.panoramas.panorama import panorama_camera
 from biresnerf.geometry.camera.camera_models import Camera, FullParameters
 from biresnerf.options.formats import Format
 
@@ -74,9 +74,14 @@ class _Pose(BaseModel, allow_inf_nan=False):
     center: _Vector
 
 
-class _Lens(BaseModel, allow_inf_nan=False):
+class _Size(BaseModel):
+    """All that a spherical camera has."""
+
     width: int
     height: int
+
+
+class _Lens(_Size, allow_inf_nan=False):
     focal_length: float
     principal_point: tuple[float, float]
 
@@ -120,7 +125,8 @@ def _pointed(value: Any) -> Any:
 
 def _read_lens(value: Any, where: str) -> Camera:
     if isinstance(value, dict) and "focal_length" not in value:
-        raise panorama("has no focal length, as a spherical camera", where)
+        sphere = checked(_Size, value, where, _HINT)
+        return panorama_camera(sphere.width, sphere.height, where)
     lens = checked(_Lens, value, where, _HINT)
     key = next((key for key in _COEFFICIENTS if key in value), None)
     names = _COEFFICIENTS[key] if key else ()

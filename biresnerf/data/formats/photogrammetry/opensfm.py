@@ -21,7 +21,7 @@ from pydantic import BaseModel
 from biresnerf.data.formats.bad_frames import attempt
 from biresnerf.data.formats.codec import Codec, head_holds
 from biresnerf.data.formats.colmap.model_checks import image_name, rigid_pose
-from biresnerf.data.formats.parsed_poses import LensOf, ParsedPoses
+from biresnerf.data.formats.parsed_poses import LensOf, ParsedPoses, panorama_lens
 from biresnerf.data.formats.photogrammetry.lens_limits import BROWN, FISHEYE, refuse_other_lenses
 from biresnerf.data.formats.pose_rows import Placed, Row, at_size_of, folder_with_photos, lens_of, parsed_rows
 from biresnerf.data.model.atomic_file import write_json
@@ -29,7 +29,6 @@ from biresnerf.data.model.colmap_scene import matrix_of_pose
 from biresnerf.data.model.conventions import quat_wxyz_from_rotation
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.model.untrusted_file import checked, invalid_file, read_json
-from biresnerf.data.photos.kinds.panorama import panorama
 from biresnerf.data.photos.photo_folders import IMAGE_FOLDER
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera, FullParameters
@@ -146,7 +145,7 @@ def read_lens(value: Any, where: str) -> Camera | LensOf:
     lens = checked(_Lens, value, where, _HINT)
     kind = lens.projection_type
     if kind in ("spherical", "equirectangular"):
-        raise panorama(f"the camera type is {kind}", where)
+        return panorama_lens
     if kind not in _LENSES:
         raise InputError(
             "camera_model_unsupported",

@@ -56,9 +56,8 @@ class KnownDistance:
 
 
 def _end(name: str, dataset: Dataset) -> int | tuple[float, float, float]:
-    for names in (dataset.names, dataset.file_names):
-        if name in names:
-            return names.index(name)
+    if rows := dataset.called(name):
+        return rows[0]
     try:
         x, y, z = (float(word) for word in name.split())
     except ValueError:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -31,10 +32,14 @@ def position_priors(dataset: Dataset) -> PositionPriors | None:
     """
     if dataset.positions is not None:
         return dataset.positions
+    if dataset.cut is not None:
+        # Of a panorama's views the first alone, so that its position counts once.
+        found = position_priors(dataset.cut.whole)
+        return None if found is None else replace(found, rows=dataset.cut.firsts[found.rows])
     table, _ = _of_table(dataset)
     for one in (table, _of_metashape(dataset)):
-        if one is not None and (found := _by_frame(dataset, one)):
-            return _priors(one.source, found, one.epsg, in_degrees=one.in_degrees)
+        if one is not None and (places := _by_frame(dataset, one)):
+            return _priors(one.source, places, one.epsg, in_degrees=one.in_degrees)
     tags = {i: tag for i, f in enumerate(dataset.frames) if (tag := read_geotag(f.path, f.name)) is not None}
     return _priors("EXIF", tags, WGS84, in_degrees=True) if tags else None
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from biresnerf.data.formats.parsed_poses import FrameCamera
+from biresnerf.data.formats.parsed_poses import FrameCamera, panorama_lens
 from biresnerf.data.formats.transforms.write_intrinsics import FOCAL_KEYS
 from biresnerf.data.photos.guessed_lens import guess_lens, guess_note
 from biresnerf.data.photos.image_files import ImageHeader
-from biresnerf.data.photos.kinds.panorama import panorama
 from biresnerf.data.photos.orientation import same_shape
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import (
@@ -17,6 +16,7 @@ from biresnerf.geometry.camera.camera_models import (
     FISHEYE_MODELS,
     MODEL_IDS,
     MODEL_PARAMETERS,
+    PANORAMA,
     Camera,
     FullParameters,
     smallest_model,
@@ -25,7 +25,7 @@ from biresnerf.geometry.camera.lens import lens_problem
 
 _UNSUPPORTED = "camera_model_unsupported"
 # Keys of instant-ngp that mean a lens of neither family.
-_F_THETA, _PANORAMAS = "ftheta_p0", ("latlong", "equirectangular")
+_F_THETA, _LATLONG, _EQUAL_AREA = "ftheta_p0", "latlong", "equirectangular"
 _FOCAL_DIFFERS = 0.01  # angles in files have few digits
 _MODEL_HINT = (
     f"Supported are {', '.join(MODEL_IDS)}; undistort the images to one of them "
@@ -70,6 +70,8 @@ def camera_of_frame(fields: Fields, header: ImageHeader, name: str) -> FrameCame
         InputError: ``camera_model_unsupported``, ``intrinsics_missing``, ``intrinsics_invalid`` or
             ``image_size_mismatch``.
     """
+    if _shows_all(fields):
+        return panorama_lens(header, name)
     preferred, fisheye = _declared_lens(fields)
     width, height, notes = _declared_size(fields, header, name)
     if not any(fields.get(key) is not None for key in FOCAL_KEYS):
@@ -117,12 +119,19 @@ def _short(value: Any) -> str:
     return text if len(text) <= 40 else text[:37] + "..."
 
 
+def _shows_all(fields: Fields) -> bool:
+    """Whether the file calls the photo a panorama: by nerfstudio's camera model, or instant-ngp's key."""
+    declared = fields.frame.get("camera_model") or fields.top.get("camera_model")
+    latlong = fields.frame.get(_LATLONG) or fields.top.get(_LATLONG)
+    return str(declared).upper() == PANORAMA or bool(latlong)
+
+
 def _declared_lens(fields: Fields) -> tuple[str | None, bool]:
     """The model that the file names, and whether the lens is a fisheye's."""
     declared = fields.frame.get("camera_model") or fields.top.get("camera_model")
-    for key in _PANORAMAS:
-        if fields.frame.get(key) or fields.top.get(key) or str(declared).lower() == key:
-            raise panorama(key, fields.where(key if str(declared).lower() != key else "camera_model"))
+    if fields.frame.get(_EQUAL_AREA) or fields.top.get(_EQUAL_AREA):
+        what = f"{_EQUAL_AREA}: instant-ngp's projection of this name is an equal-area one, which is not supported."
+        raise _unsupported(fields, _EQUAL_AREA, what)
     if fields.frame.get(_F_THETA) or fields.top.get(_F_THETA):
         raise _unsupported(fields, _F_THETA, f"{_F_THETA}: f-theta lenses are not supported.")
     if declared is not None and (not isinstance(declared, str) or declared.upper() not in MODEL_IDS):

@@ -13,15 +13,17 @@ _COLMAPS = ("FULL_OPENCV", "THIN_PRISM_FISHEYE")
 
 def family(camera: Camera) -> str:
     """``camera_model`` of the file; one of `_COLMAPS`, which nerfstudio does not know, where nothing less will do."""
-    if camera.model in _COLMAPS:
+    if camera.model in _COLMAPS or camera.panorama:
         return camera.model
     return "OPENCV_FISHEYE" if camera.full().fisheye else "OPENCV"
 
 
 def lens_values(camera: Camera) -> dict[str, Any]:
     """Size and intrinsics by their keys."""
-    p = camera.full()
     values: dict[str, Any] = {"w": camera.width, "h": camera.height}
+    if camera.panorama:
+        return {"camera_model": camera.model, **values}
+    p = camera.full()
     values |= {"fl_x": p.fx, "fl_y": p.fy, "cx": p.cx, "cy": p.cy}
     names = ngp_coefficients(p) if camera.model not in _COLMAPS else MODEL_PARAMETERS[camera.model][4:]
     return values | {name: getattr(p, name) for name in names}
@@ -43,6 +45,9 @@ def put_lens(place: dict[str, Any], camera: Camera) -> None:
     Angles stay angles where they suffice: a Blender file gets no focal length in pixels as long as its pixels are
     square and its principal point is in the middle. Other keys are added where they are not zero.
     """
+    if camera.panorama:
+        place |= lens_values(camera)
+        return
     p = camera.full()
     angles = {
         "camera_angle_x": 2 * math.atan(camera.width / (2 * p.fx)),

@@ -118,7 +118,7 @@ def test_one_bad_shot_costs_one_image_its_pose(tmp_path, change, code, where):
 @pytest.mark.parametrize(
     ("change", "code"),
     [
-        (lambda d: d[0]["cameras"]["0"].update(projection_type="spherical"), "camera_model_unsupported"),
+        (lambda d: d[0]["cameras"]["0"].update(projection_type="dual"), "camera_model_unsupported"),
         (lambda d: d[0]["cameras"]["0"].update(focal_x=-1), "intrinsics_invalid"),
         (lambda d: d[0].pop("shots"), "pose_file_invalid"),
         (lambda d: d[0]["shots"].update({"../a.jpg": {}}), "unsafe_path"),
