@@ -12,7 +12,7 @@ import biresnerf
 from biresnerf.errors import InputError
 from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.geometry.similarity import align_by_spread
-from tests.data.scenes import textured_arc
+from tests.data.scenes import plain_features, textured_arc
 
 pytestmark = pytest.mark.slow
 
@@ -20,6 +20,7 @@ pytest.importorskip("pycolmap", reason="needs pycolmap (pip install 'biresnerf[c
 OLD, ALL = 8, 10
 OPTIONS = {
     "preset": "fast", "device": "cpu", "steps": 80, "max_image_size": 24, "samples_per_step": 1024, "orbit_frames": 0,
+    "verdict": False,
     "pose_resolution_max": 16, "reconstruction_levels": 1, "reconstruction_resolution_max": 128, "table_size_log2": 10,
 }  # fmt: skip
 
@@ -35,12 +36,14 @@ def earlier(truth, tmp_path_factory) -> biresnerf.Result:
     folder = tmp_path_factory.mktemp("old")
     for photo in sorted(truth[0].iterdir())[:OLD]:
         shutil.copy(photo, folder)
-    return biresnerf.refine(folder, folder.with_name("result"), **OPTIONS)
+    with plain_features():
+        return biresnerf.refine(folder, folder.with_name("result"), **OPTIONS)
 
 
 def test_new_photos_join_the_frame_of_a_result_whose_poses_and_lenses_stay(truth, earlier, tmp_path):
     folder, poses = truth
-    joined = biresnerf.refine(folder, tmp_path / "more", fixed_from=earlier.folder, **OPTIONS)
+    with plain_features():
+        joined = biresnerf.refine(folder, tmp_path / "more", fixed_from=earlier.folder, **OPTIONS)
     assert joined.names[:OLD] == earlier.names
     np.testing.assert_allclose(joined.poses[:OLD], earlier.poses, atol=1e-9)
     assert set(joined.intrinsics) == set(earlier.intrinsics)

@@ -18,7 +18,7 @@ PAIR_OUTLIER = 3.0  # median disagreements beyond which a pair's matches are tak
 PAIR_OUTLIER_DEG = 30.0  # but not below this
 # Matches nearer than this, px at the size at which COLMAP's bounds hold, stay where they are (COLMAP's default). Of a
 # scene that moves, eight times as many move by a third of it to all of it as by less; of something that stands still,
-# nearly none do. Beside a moving camera at most 0.4 % of the pairs show both (eleven sets), before a still one 98 %.
+# nearly none do. Beside a moving camera at most 0.4 % of the pairs show both (sixteen sets), before a still one 98 %.
 STILL_PX, INNER, FEWEST_STILL, STILL_PAIRS = 4.0, 1 / 3, 8, 0.1
 
 
