@@ -7,7 +7,7 @@ import json
 import uuid
 from collections.abc import Mapping, Sequence
 from datetime import datetime
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypedDict, Unpack
 
 from biresnerf.client.transport import Call, Transport, parse
 from biresnerf.options.formats import ExportName
@@ -34,6 +34,20 @@ OptionsLike: TypeAlias = RefineOptions | Mapping[str, Any] | None
 _LOG_LINES = 1000
 
 
+class JobDetails(TypedDict, total=False):
+    """What a new job may have beside its input, options and labels.
+
+    Attributes:
+        priority: before or after other jobs.
+        webhook: where messages about it go.
+        fixed_from: a job with a result of some of the photos: they keep its poses and lenses, others join its frame.
+    """
+
+    priority: PriorityName
+    webhook: JobWebhook
+    fixed_from: str
+
+
 class JobCalls(Transport):
     """Requests about jobs and their results."""
 
@@ -43,17 +57,15 @@ class JobCalls(Transport):
         options: OptionsLike = None,
         *,
         labels: Mapping[str, str] | None = None,
-        priority: PriorityName = "normal",
-        webhook: JobWebhook | None = None,
         idempotency_key: str | None = None,
+        **details: Unpack[JobDetails],
     ) -> JobView:
         """Queues a refinement of a dataset. Requests with the same key queue it once and return the same job."""
         body = NewJob(
             dataset_id=dataset_id,
             options=as_options(options),
             labels=dict(labels or {}),
-            webhook=webhook,
-            priority=priority,
+            **details,
         )
         return await self._queue("/v1/jobs", body, idempotency_key)
 

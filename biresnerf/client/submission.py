@@ -5,19 +5,25 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Unpack
 
 from anyio import to_thread
 
 from biresnerf.client.dataset_calls import DatasetCalls
 from biresnerf.client.errors import ServiceError
-from biresnerf.client.job_calls import JobCalls, OptionsLike, as_options, idempotency_key_of, with_name
+from biresnerf.client.job_calls import (
+    JobCalls,
+    JobDetails,
+    OptionsLike,
+    as_options,
+    idempotency_key_of,
+    with_name,
+)
 from biresnerf.client.scene import look_at
 from biresnerf.client.transport import tell
 from biresnerf.client.uploads import LocalFile, Uploads
 from biresnerf.wire.datasets import DatasetView
-from biresnerf.wire.jobs import JobView, NewJob, PriorityName
-from biresnerf.wire.webhooks import JobWebhook
+from biresnerf.wire.jobs import JobView, NewJob
 
 
 @dataclass(frozen=True)
@@ -42,11 +48,10 @@ class Submissions(DatasetCalls, JobCalls, Uploads):
         *,
         name: str | None = None,
         labels: Mapping[str, str] | None = None,
-        priority: PriorityName = "normal",
-        webhook: JobWebhook | None = None,
         idempotency_key: str | None = None,
         resume: str | None = None,
         on_progress: Callable[[Sending], object] = lambda _: None,
+        **details: Unpack[JobDetails],
     ) -> JobView:
         """Sends the missing files of a folder (or file with poses), has them checked, and queues a job.
 
@@ -57,6 +62,7 @@ class Submissions(DatasetCalls, JobCalls, Uploads):
             name: of the dataset, and of the job unless ``labels`` has a ``name``. Default: the folder's.
             resume: the dataset of an interrupted submission.
             on_progress: called at each step, and with the bytes sent.
+            details: `priority`, `webhook`, `fixed_from`: see `JobDetails`.
 
         Raises:
             InputError: the folder or the options cannot be used; nothing was sent then.
@@ -78,8 +84,7 @@ class Submissions(DatasetCalls, JobCalls, Uploads):
                 dataset_id=ready.id,
                 options=wanted,
                 labels=with_name(labels or {}, target.name),
-                webhook=webhook,
-                priority=priority,
+                **details,
             )
             return await self._queue("/v1/jobs", body, idempotency_key or idempotency_key_of(body))
         except ServiceError as error:

@@ -10,11 +10,12 @@ from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.part_of_set import with_frames
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
+from biresnerf.options.refine_options import RefineOptions
 from biresnerf.result import load
 
 
-def joined_to(dataset: Dataset, result: Path) -> tuple[Dataset, tuple[str, ...]]:
-    """The set with the result's poses and lenses for the photos that the result has; and the names of these.
+def joined_to(dataset: Dataset, options: RefineOptions, result: Path) -> tuple[Dataset, RefineOptions]:
+    """The set with the result's poses and lenses for the photos that the result has; and options that keep these.
 
     Photos that share a camera with one of them see through its lens, if all of them see through one.
 
@@ -28,7 +29,7 @@ def joined_to(dataset: Dataset, result: Path) -> tuple[Dataset, tuple[str, ...]]
     if not found:
         raise InputError(
             "no_common_images",
-            f"has no photo of the result in {result}.",
+            "has no photo of the earlier result.",
             where=dataset.root.name,
             hint="Give the old photos under their old names, and the new ones beside them.",
         )
@@ -53,7 +54,8 @@ def joined_to(dataset: Dataset, result: Path) -> tuple[Dataset, tuple[str, ...]]
     shared = _shared(dataset, [frame.camera for frame in frames])
     joined = [replace(frame, camera=shared.get(frame.camera, frame.camera)) for frame in frames]
     seen_by_all = replace(dataset, cameras=tuple(cameras), intrinsics_sources=tuple(sources))
-    return with_frames(seen_by_all, joined), tuple(found)
+    fixed = dict.fromkeys((*options.fixed, *found))
+    return with_frames(seen_by_all, joined), options.model_copy(update={"fixed": tuple(fixed)})
 
 
 def _shared(dataset: Dataset, now: list[int]) -> dict[int, int]:

@@ -65,10 +65,7 @@ def refine(
         videos = VideoReading(asked.video_frames, watch)
         dataset = read_dataset(Path(input), strict=asked.bad_frames == "refuse", videos=videos)
         if fixed_from is not None:
-            dataset, known = joined_to(dataset, Path(fixed_from))
-            asked = asked.model_copy(
-                update={"fixed": (*asked.fixed, *(n for n in known if n not in asked.fixed))}
-            )
+            dataset, asked = joined_to(dataset, asked, Path(fixed_from))
         from biresnerf.pipeline import refine_poses  # loads torch, which takes seconds
 
         refine_poses(dataset, output, asked, on_progress, stop, overwrite=overwrite)

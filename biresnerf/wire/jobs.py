@@ -75,6 +75,10 @@ class JobView(Record):
     forked_stage: ReusableStage | None = Field(
         None, description="The stage of that job whose result was reused."
     )
+    fixed_from: str | None = Field(
+        None,
+        description="The job whose poses and lenses the photos that both have keep; the others join its frame.",
+    )
     dataset_id: str = Field(examples=["ds_01JD8Y3V1QKZ5M0C7W2N4T6XAB"])
     state: JobState = Field(examples=["running"])
     stage: Stage | None = Field(None, examples=["coarse"])
@@ -176,6 +180,13 @@ class NewJob(JobTexts):
     )
 
     dataset_id: str = Field(max_length=100, pattern=NO_CONTROLS)
+    fixed_from: str | None = Field(
+        None,
+        max_length=100,
+        pattern=NO_CONTROLS,
+        description="A job with a result of some of the dataset's photos: these keep its poses and lenses, and "
+        "the others join its frame.",
+    )
 
 
 class CancelJob(Record):

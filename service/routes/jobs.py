@@ -57,6 +57,7 @@ _DISCARD = CancelJob()
         *("bad_idempotency_key", "not_found", "dataset_not_ready", "invalid_options"),
         *("idempotency_key_reused", "archive_rejected", "queue_full", "storage_full", "too_many_uploads"),
         *("webhook_url_refused", "priority_not_allowed", "quota_exhausted"),
+        *("result_not_ready", "state_conflict", "expired"),
     )
     | {200: {"model": JobView, "description": "The job has ended; only with `Prefer: wait`."}},
 )
@@ -85,6 +86,7 @@ async def submit_job(
             idempotency_key=idempotency_key,
             webhook=body.webhook,
             priority=body.priority,
+            fixed_from=body.fixed_from,
         )
     else:
         raise ProblemError(

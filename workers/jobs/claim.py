@@ -33,6 +33,7 @@ class Claim:
     token: uuid.UUID
     kind: JobKind
     parent: str | None
+    fixed_from: str | None
     options: dict[str, Any]
     smaller: dict[str, Any]
     checkpoint: dict[str, Any] | None
@@ -83,7 +84,7 @@ async def _claim(
 
 
 def _claimed(row: dict[str, Any], token: uuid.UUID) -> Claim:
-    same = ("dataset_id", "attempt", "kind", "parent", "options", "smaller")
+    same = ("dataset_id", "attempt", "kind", "parent", "fixed_from", "options", "smaller")
     also = ("checkpoint", "reusable", "trace")
     return Claim(
         row["id"],

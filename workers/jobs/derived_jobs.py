@@ -14,19 +14,18 @@ from biresnerf.wire.jobs import JobView, WantedStage
 from workers.database.database import Connection
 from workers.database.ids import new_id
 from workers.jobs.forks import LATEST_FIRST, plan_fork
-from workers.jobs.job_rows import JOB, asked_columns, fingerprint_of, job_from_row, known_job
+from workers.jobs.job_rows import JOB, asked_columns, fingerprint_of, job_from_row, known_job, require_result
 from workers.jobs.job_states import insert_job, queue_job
 from workers.jobs.jobs import JobStore
 from workers.jobs.quotas import require_room, submitting_for
 from workers.records import PRIORITIES
-from workers.settings.errors import Conflict, Expired
+from workers.settings.errors import Conflict
 from workers.store.files import FileStore
 from workers.store.trash import discard, rescue
 
 NORMAL = PRIORITIES["normal"]
 # Of a fork that never came to be; long after any request has ended.
 ABANDONED_S = 3600
-EXPORTABLE = ("poses.json", "colmap/sparse/0/cameras.bin", "colmap/sparse/0/images.bin")
 
 
 class DerivedJobs(JobStore):
@@ -56,6 +55,8 @@ class DerivedJobs(JobStore):
             parent = await self._required(connection, job_id)
             if parent["kind"] != "refine":
                 raise Conflict("fork_not_possible", f"{job_id} is an export.")
+            if parent["fixed_from"] is not None:
+                require_result(await self._required(connection, parent["fixed_from"]))
             options, stage = plan_fork(parent, changes, wanted)
             asked = asked_columns(options)
             fingerprint = fingerprint_of(f"fork {job_id} {stage}", options.model_dump(mode="json"), labels)
@@ -76,6 +77,7 @@ class DerivedJobs(JobStore):
                 "fingerprint": fingerprint,
                 "reusable": Jsonb(copied),
                 "forked_from": job_id,
+                "fixed_from": parent["fixed_from"],
                 "forked_stage": stage,
             }
             await rescue(connection, f"jobs/{fork_id}")
@@ -123,7 +125,7 @@ class DerivedJobs(JobStore):
         fingerprint = fingerprint_of(f"export {job_id}", options, None)
         async with self._database.transaction() as connection:
             parent = await self._required(connection, job_id)
-            _require_result(parent)
+            require_result(parent)
             await submitting_for(connection, parent["dataset_id"], self._tenant)
             same = await connection.row(
                 JOB + " WHERE parent = %s AND fingerprint = %s AND kind = 'export'"
@@ -156,15 +158,3 @@ class DerivedJobs(JobStore):
         row = {"id": job_id, "dataset_id": parent["dataset_id"], "tenant": parent["tenant"], **values}
         await queue_job(connection, await insert_job(connection, row))
         return job_from_row(await self._required(connection, job_id))
-
-
-def _require_result(parent: Mapping[str, Any]) -> None:
-    if parent["kind"] != "refine":
-        raise Conflict("state_conflict", f"{parent['id']} is an export itself.")
-    if parent["state"] == "expired":
-        raise Expired(f"The files of job {parent['id']} were kept for their time and are gone.")
-    if parent["state"] in ("queued", "running"):
-        raise Conflict("result_not_ready", f"The job is {parent['state']}.")
-    names = {item["name"] for item in parent["artifacts"]}
-    if not names.issuperset(EXPORTABLE):
-        raise Conflict("state_conflict", f"The job {parent['state']} without a whole set of poses.")

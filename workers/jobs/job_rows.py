@@ -13,7 +13,7 @@ from biresnerf.options.refine_options import RefineOptions
 from biresnerf.wire.jobs import JobEvent, JobProgress, JobView, PriorityName
 from workers.database.database import Connection
 from workers.records import PREVIEW_FOLDER, THUMBNAIL_NAME, priority_name, record_from_row
-from workers.settings.errors import Conflict
+from workers.settings.errors import Conflict, Expired
 
 JOB = """
     SELECT jobs.*, CASE WHEN jobs.state = 'queued' THEN
@@ -24,6 +24,7 @@ JOB = """
 # The same for many at once: counting for each job takes seconds where thousands wait.
 PLACES = """places AS (SELECT queue_id, row_number() OVER (PARTITION BY kind ORDER BY queue_order, queue_id)
     AS queue_position FROM jobs WHERE state = 'queued')"""
+WHOLE_RESULT = ("poses.json", "report.json", "colmap/sparse/0/cameras.bin", "colmap/sparse/0/images.bin")
 # With the store's tenant as parameter; none for all tenants.
 MINE = "jobs.tenant = coalesce(%s, jobs.tenant)"
 
@@ -37,6 +38,19 @@ def job_from_row(row: dict[str, Any]) -> JobView:
         priority=priority_name(row["priority"]),
         thumbnail=_thumbnail(row),
     )
+
+
+def require_result(row: Mapping[str, Any]) -> None:
+    """Raises `Expired` or `Conflict` (``result_not_ready``, ``state_conflict``) for a job without all its poses."""
+    if row["kind"] != "refine":
+        raise Conflict("state_conflict", f"{row['id']} is an export itself.")
+    if row["state"] == "expired":
+        raise Expired(f"The files of job {row['id']} were kept for their time and are gone.")
+    if row["state"] in ("queued", "running"):
+        raise Conflict("result_not_ready", f"The job is {row['state']}.")
+    names = {item["name"] for item in row["artifacts"]}
+    if not names.issuperset(WHOLE_RESULT):
+        raise Conflict("state_conflict", f"The job {row['state']} without a whole set of poses.")
 
 
 def _thumbnail(row: dict[str, Any]) -> str | None:

@@ -25,6 +25,7 @@ from workers.jobs.job_rows import (
     fingerprint_of,
     job_from_row,
     known_job,
+    require_result,
 )
 from workers.jobs.job_states import delete_job, insert_job, queue_job, request_cancel
 from workers.jobs.job_updates import JobListener, follow
@@ -66,18 +67,21 @@ class JobStore(OwnedStore):
         request_digest: str | None = None,
         webhook: JobWebhook | None = None,
         priority: PriorityName = "normal",
+        fixed_from: str | None = None,
     ) -> tuple[JobView, bool]:
         """Queue a job at its tenant's turn; the job and its queue entry are written in one transaction.
 
         ``request_digest`` stands for the dataset when requests are compared, where the client sent the
         files themselves and the dataset was made for them (see `repeated`).
         Returns the job and whether it is new (False: the same key with the same request came before).
-        Raises `NotFound` (dataset), `Conflict` (``dataset_not_ready``, ``idempotency_key_reused``,
-        ``priority_not_allowed``), `LimitReached` (``queue_full``, ``quota_exhausted``),
+        ``fixed_from`` is a job whose poses and lenses stay, of photos that both have.
+        Raises `NotFound` (dataset, job), `Conflict` (``dataset_not_ready``, ``idempotency_key_reused``,
+        ``priority_not_allowed``, a code of `require_result`), `LimitReached` (``queue_full``, ``quota_exhausted``),
         `InputError` (``webhook_url_refused``).
         """
         asked = asked_columns(options)
         subject = request_with(request_digest or dataset_id, webhook)
+        subject += "" if fixed_from is None else f" fixed from {fixed_from}"
         fingerprint = fingerprint_of(subject, options.model_dump(mode="json"), labels, priority)
         async with self._database.transaction() as connection:
             tenant = await submitting_for(connection, dataset_id, self._tenant)
@@ -85,6 +89,8 @@ class JobStore(OwnedStore):
                 known = await known_job(connection, tenant, idempotency_key, fingerprint)
                 if known is not None:
                     return known, False
+            if fixed_from is not None:
+                require_result(await self._required(connection, fixed_from))
             await require_room(connection, dataset_id, PRIORITIES[priority], self._settings.max_queued)
             job_id = new_id("job")
             values = {
@@ -92,6 +98,7 @@ class JobStore(OwnedStore):
                 "dataset_id": dataset_id,
                 "tenant": tenant,
                 "priority": PRIORITIES[priority],
+                "fixed_from": fixed_from,
                 **asked,
                 "labels": Jsonb(dict(labels or {})),
                 "idempotency_key": idempotency_key,
@@ -166,10 +173,13 @@ class JobStore(OwnedStore):
             if row["state"] in ("queued", "running"):
                 raise Conflict("state_conflict", f"Job {job_id} is {row['state']}; cancel it first.")
             busy = await connection.row(
-                "SELECT id FROM jobs WHERE parent = %s AND state IN ('queued', 'running')", job_id
+                "SELECT id FROM jobs WHERE (parent = %s OR fixed_from = %s) AND state IN ('queued', 'running')",
+                *(job_id, job_id),
             )
             if busy is not None:
-                raise Conflict("state_conflict", f"Its export {busy['id']} is not over; cancel that first.")
+                raise Conflict(
+                    "state_conflict", f"{busy['id']}, which needs it, is not over; cancel that first."
+                )
             await delete_job(connection, job_id)
 
     async def events(self, job_id: str, *, after: int = 0, limit: int = 1000) -> tuple[JobEvent, ...]:

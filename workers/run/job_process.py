@@ -46,7 +46,7 @@ class Order(FrozenModel):
     input: Path
     output: Path
     options: dict[str, object]
-    result: Path | None = None
+    result: Path | None = None  # that is exported, or whose poses stay
 
 
 def main(folder: Path) -> int:
@@ -116,7 +116,17 @@ def is_out_of_memory(error: Exception) -> bool:
 
 
 def _refine(order: Order, options: RefineOptions, protocol: TextIO, stop: _Stop) -> None:
+    from biresnerf.data.formats.read_dataset import read_dataset
+    from biresnerf.data.model.dataset import Dataset
+    from biresnerf.data.photos.video.video_frames import VideoReading
     from biresnerf.pipeline import refine_poses  # loads torch
+    from biresnerf.run.photos_added import joined_to
+
+    source: Path | Dataset = order.input
+    if order.result is not None:
+        videos = VideoReading(options.video_frames)
+        dataset = read_dataset(order.input, strict=options.bad_frames == "refuse", videos=videos)
+        source, options = joined_to(dataset, options, order.result)
 
     def tell(progress: Progress) -> None:
         stop.stage = progress.stage
@@ -125,7 +135,7 @@ def _refine(order: Order, options: RefineOptions, protocol: TextIO, stop: _Stop)
 
     try:
         refine_poses(
-            order.input,
+            source,
             order.output,
             options,
             on_progress=tell,

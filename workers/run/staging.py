@@ -14,6 +14,7 @@ from workers.jobs.claim import Claim, published_files
 from workers.store.files import FileStore
 
 EXPORTED_FROM = ("poses.json", "colmap/sparse/0/")  # of a result; all other formats can be made from these
+JOINED_TO = ("poses.json", "report.json")  # of a result whose poses stay
 VIDEO_FRAMES = "video_frames/"  # of a result: photos that its dataset holds as a video
 PANORAMA_VIEWS = "panorama_views/"  # of a result: what was cut from its dataset's panoramas
 
@@ -30,7 +31,11 @@ async def stage_job(database: Database, files: FileStore, claim: Claim, folder: 
     order: dict[str, Any] = {"input": "input", "output": "output", "options": options}
     if claim.kind == "export":
         order |= {"task": "export", "result": "result"}
-        await _stage_result(database, files, claim, folder / "result")
+        await _stage_result(files, await _parents_files(database, claim), EXPORTED_FROM, folder / "result")
+    if claim.fixed_from is not None:
+        order["result"] = "result"
+        found = await published_files(database, claim.fixed_from)
+        await _stage_result(files, found, JOINED_TO, folder / "result")
     if claim.kind == "refine" or _needs_photos(claim.options["formats"]):
         rows = await database.fetch(
             "SELECT key, path FROM dataset_files WHERE dataset_id = %s", claim.dataset_id
@@ -64,10 +69,11 @@ def _resumed_files(claim: Claim) -> Iterator[tuple[str, str]]:
             yield f"{part['prefix']}/{name}", name
 
 
-async def _stage_result(database: Database, files: FileStore, claim: Claim, folder: Path) -> None:
+async def _stage_result(
+    files: FileStore, found: list[tuple[str, str]], names: tuple[str, ...], folder: Path
+) -> None:
     folder.mkdir()
-    found = await _parents_files(database, claim)
-    await files.stage((pair for pair in found if pair[1].startswith(EXPORTED_FROM)), folder)
+    await files.stage((pair for pair in found if pair[1].startswith(names)), folder)
 
 
 async def _parents_files(database: Database, claim: Claim) -> list[tuple[str, str]]:

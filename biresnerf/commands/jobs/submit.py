@@ -54,6 +54,11 @@ label_option = click.option(
     help="Jobs of higher priority run first; your tenant may have a lower limit.",
 )  # fmt: skip
 @label_option
+@click.option(
+    "--fixed-from",
+    metavar="JOB",
+    help="A job with a result of some of the photos: they keep its poses and lenses, and the others join its frame.",
+)
 @click.option("--resume", metavar="DATASET", help="Resume an interrupted submission with its dataset.")
 @service_options
 @json_option
@@ -82,7 +87,9 @@ def submit_command(
     if output is not None:
         require_empty(output)
     with service_at(url, api_key) as client:
-        job = submitted(client, path, options, **how)
+        job = submitted(
+            client, path, options, **{key: value for key, value in how.items() if value is not None}
+        )
         see_through(client, job, wait=wait, timeout_s=timeout_s, output=output, as_json=as_json)
 
 

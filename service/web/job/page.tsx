@@ -133,6 +133,7 @@ function Facts({ job, seen }: { job: JobView; seen: LiveState }) {
         <Fact name="Job" value={job.id} />
         {!shared.value && <Fact name="Image set" value={job.dataset_id} link={`#/datasets/${job.dataset_id}`} />}
         {!shared.value && job.forked_from && <Fact name="Forked from" value={job.forked_from} link={`#/jobs/${job.forked_from}`} />}
+        {!shared.value && job.fixed_from && <Fact name="Joins" value={job.fixed_from} link={`#/jobs/${job.fixed_from}`} />}
         <Fact name="Submitted" value={moment(job.created_at)} />
         {job.expires_at && <Fact name="Kept until" value={moment(job.expires_at)} />}
         {seconds.map(([stage, s]) => (

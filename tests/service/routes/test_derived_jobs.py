@@ -180,3 +180,24 @@ def test_jobs_are_listed_from_a_time_on(http: httpx.Client, done_job: dict[str, 
     assert done_job["id"] not in ids(done_job["created_at"])
     assert done_job["id"] in ids("2020-01-31T12:00:00Z")
     problem(http.get("/v1/jobs", params={"created_after": "2020-01-31T12:00:00"}), 422, "invalid_request")
+
+
+def test_a_job_joins_a_finished_result_which_stays_as_long_as_it_is_needed(
+    http: httpx.Client, dataset: str
+) -> None:
+    def joined(to: str) -> httpx.Response:
+        body = {"dataset_id": dataset, "fixed_from": to, "options": {"steps": 4000, "seed": 10}}
+        return http.post("/v1/jobs", json=body)
+
+    base = submit(http, dataset, steps=60, step_ms=10)
+    problem(joined(base["id"]), 409, "result_not_ready")
+    problem(joined("job_nothing"), 404, "not_found")
+    finished(http, base["id"])
+    job = joined(base["id"]).json()
+    assert (job["fixed_from"], job["forked_from"]) == (base["id"], None)
+    answer = problem(http.delete(f"/v1/jobs/{base['id']}"), 409, "state_conflict")
+    assert job["id"] in answer["detail"]
+    http.post(job["links"]["cancel"])
+    finished(http, job["id"])
+    assert http.delete(f"/v1/jobs/{base['id']}").status_code == 204
+    problem(joined(base["id"]), 404, "not_found")

@@ -127,10 +127,17 @@ class _Arrays:
     def margins(self, picture: Size) -> list[Margin]:
         """The empty margins of the pictures, in pixels of ``picture``."""
         name = self.name_of(_PICTURES)
-        if name is None or self.file.suffix.lower() != ".npz":
+        shape = self.shapes.get(name or "", ())
+        if (
+            name is None
+            or self.file.suffix.lower() != ".npz"
+            or len(shape) != 4
+            or 3 not in (shape[1], shape[3])
+        ):
             return [Margin()] * self.count
-        per_pixel = picture[0] / _size(self.shapes[name])[0]
-        return [_margin(row, per_pixel) for row in npz_rows(self.file, name, _HINT)]
+        per_pixel = picture[0] / max(1, _size(shape)[0])
+        rows = [_margin(row, per_pixel) for row in npz_rows(self.file, name, _HINT)]
+        return rows or [Margin()] * self.count
 
 
 def _size(shape: tuple[int, ...]) -> Size:
@@ -177,7 +184,11 @@ def _parse(dialect: str, names: tuple[str, ...], file: Path) -> ParsedPoses:
 def _lenses(arrays: _Arrays, name: str) -> tuple[Array, Array | None]:
     """Focal lengths [n, 2] and principal points [n, 2] of the pictures; None where they are not said."""
     lenses, centres = arrays.numbers(name), arrays.name_of(_CENTRES)
-    centre = None if centres is None else arrays.numbers(centres).reshape(arrays.count, -1)[:, :2]
+    centre = None if centres is None else arrays.numbers(centres)
+    if centre is not None and centre.shape != (arrays.count, 2):
+        raise invalid_file(
+            f"{arrays.file.name} {centres}", f"has the shape {centre.shape}, not [n, 2].", _HINT
+        )
     if lenses.shape[1:] == (3, 3):
         return lenses[:, [0, 1], [0, 1]], lenses[:, :2, 2] if centre is None else centre
     if lenses.size not in (arrays.count, 2 * arrays.count):

@@ -154,6 +154,18 @@ def test_photos_of_one_lens_share_the_median_of_what_was_predicted_for_each(tmp_
     assert len(with_shared_predictions(read_dataset(tmp_path)).cameras) == 4
 
 
+@pytest.mark.parametrize("images", [np.zeros((4, 3), np.float32), np.zeros((4, 3, 350, 518), np.uint8)])
+def test_pictures_in_another_form_say_nothing_of_margins(tmp_path, images):
+    _, lenses = predicted(tmp_path, SIZES["landscape"], programs.vggt_crop)
+    arrays = {"extrinsic": cam_from_world(), "intrinsic": lenses, "images": images}
+    np.savez(tmp_path / "predictions.npz", depth=np.zeros((4, 350, 518)), **arrays)
+    assert_true(read_dataset(tmp_path), SIZES["landscape"])
+    np.savez(tmp_path / "predictions.npz", **{**arrays, "intrinsic": lenses[:, 0]})
+    with pytest.raises(InputError) as caught:
+        read_dataset(tmp_path)
+    assert_complete(caught.value, "pose_file_invalid", "predictions.npz intrinsic")
+
+
 def test_a_file_without_lenses_or_with_fewer_photos_is_refused_by_name(tmp_path):
     _, lenses = predicted(tmp_path, SIZES["landscape"], programs.da3_resize)
     np.savez(tmp_path / "results.npz", extrinsics=cam_from_world(), depth=np.zeros((4, 336, 504)))
