@@ -116,12 +116,12 @@ def dataset_of(
     if within is not None:
         refuse_outside([path for path, _ in images], [entry.name for _, entry in images], within, place)
     photos = read_photos(images, strict=strict)
-    cameras: dict[tuple[Camera, IntrinsicsSource, int | None], int] = {}
+    cameras: dict[tuple[Camera, IntrinsicsSource, int | None, tuple[str, ...]], int] = {}
     frames = []
     for (path, entry), lens, orientation, levels in zip(
         photos.images, photos.lenses, photos.orientations, photos.levels, strict=True
     ):
-        index = cameras.setdefault((lens.camera, lens.source, entry.camera_id), len(cameras))
+        index = cameras.setdefault((lens.camera, lens.source, entry.camera_id, lens.taken_with), len(cameras))
         mask, inverted = entry.mask or mask_beside(root, path, entry.name, within)
         frames.append(
             Frame(
@@ -137,11 +137,11 @@ def dataset_of(
     lens_notes += shear_notes([lens.camera for lens in photos.lenses])
     return Dataset(
         root,
-        tuple(camera for camera, _, _ in cameras),
+        tuple(camera for camera, *_ in cameras),
         tuple(frames),
         source,
         tuple(dict.fromkeys([*notes, *photos.notes, *lens_notes, *missing, *mask_notes(root, frames)])),
-        tuple(by for _, by, _ in cameras),
+        tuple(by for _, by, *_ in cameras),
     )
 
 

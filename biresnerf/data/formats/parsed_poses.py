@@ -20,12 +20,20 @@ from biresnerf.geometry.camera.camera_models import Camera
 
 
 class FrameCamera(NamedTuple):
-    """The camera of one image, who found its intrinsics, whether other images share them, and notes for the user."""
+    """The camera of one image, and where it comes from.
+
+    Attributes:
+        source: who found its intrinsics.
+        shared: whether other images share them, as the input says.
+        notes: for the user.
+        taken_with: the photo's, where the intrinsics are not given: what differs in it has another lens.
+    """
 
     camera: Camera
     source: IntrinsicsSource = "given"
     shared: bool = False
     notes: tuple[str, ...] = ()
+    taken_with: tuple[str, ...] = ()
 
 
 # The lens of an image by its header and name, where the pose file does not give it without them. It fits the header.

@@ -93,6 +93,7 @@ def _sound_camera(entry: PoseEntry, header: ImageHeader) -> FrameCamera:
     if header.equirectangular and (found.source != "given" or header.width == 2 * header.height):
         return panorama_lens(header, entry.name)._replace(source="exif")
     if found.source != "given":
+        found = found._replace(taken_with=header.taken_with)
         if header.width != 2 * header.height:
             return found
         note = (

@@ -42,16 +42,16 @@ def guess_note(source: IntrinsicsSource) -> str:
 
 
 def with_shared_predictions(dataset: Dataset) -> Dataset:
-    """The set with one SIMPLE_RADIAL camera for photos of a size and EXIF's focal length, of those predicted.
+    """The set with one SIMPLE_RADIAL camera for photos of a size and a lens by their EXIF, of those predicted.
 
     It has their medians. Predictions that differ as much as guesses do are of lenses that differ.
     """
-    alike: dict[tuple[int, int, float | None], list[int]] = defaultdict(list)
+    alike: dict[tuple[int, int, tuple[str, ...]], list[int]] = defaultdict(list)
     for row, frame in enumerate(dataset.frames):
         if dataset.source_of_intrinsics(frame.camera) == "predicted":
             header = read_header(frame.path, frame.name)
             camera = dataset.camera_of(row)
-            alike[camera.width, camera.height, exif_focal_px(header)].append(row)
+            alike[camera.width, camera.height, header.taken_with].append(row)
     cameras, sources = list(dataset.cameras), list(dataset.intrinsics_sources)
     frames = list(dataset.frames)
     for (width, height, _), rows in alike.items():

@@ -37,6 +37,8 @@ EXIF_ORIENTATION = 0x0112
 _TIFF_WIDTH, _TIFF_HEIGHT = 0x0100, 0x0101
 _EXIF_SUB_IFD = 0x8769
 _FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 0x920A, 0xA405
+_MAKE, _MODEL = 0x010F, 0x0110
+_LENS_MODEL, _BODY_SERIAL, _LENS_SERIAL = 0xA434, 0xA431, 0xA435
 _PIXEL_X, _PIXEL_Y = 0xA002, 0xA003
 _FOCAL_PLANE_X, _FOCAL_PLANE_Y, _FOCAL_PLANE_UNIT = 0xA20E, 0xA20F, 0xA210
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}  # inch, cm, mm, um
@@ -70,6 +72,8 @@ class ImageHeader(NamedTuple):
         focal_plane: the sensor's resolution, which makes pixels of `focal_mm`.
         several: the file holds more pages or frames than the first one.
         sixteen_bit: its values are grey ones of 16 bits.
+        taken_with: make, model and serial number of the camera, model and serial number of its lens, and the focal
+            length (mm): photos that differ in them have lenses that differ.
         equirectangular: its XMP calls it a panorama of this projection.
     """
 
@@ -82,6 +86,7 @@ class ImageHeader(NamedTuple):
     several: bool = False
     equirectangular: bool = False
     sixteen_bit: bool = False
+    taken_with: tuple[str, ...] = ()
 
 
 @contextmanager
@@ -270,7 +275,10 @@ def _with_exif(header: ImageHeader, exif: Image.Exif) -> ImageHeader:
     if unit and (x or y):
         width, height = (_positive(details.get(key)) or 0 for key in (_PIXEL_X, _PIXEL_Y))
         plane = FocalPlane((x or y or 0) / unit, (y or x or 0) / unit, int(width), int(height))
+    said = [exif.get(_MAKE), exif.get(_MODEL), details.get(_BODY_SERIAL)]
+    said += [details.get(_LENS_MODEL), details.get(_LENS_SERIAL), _positive(details.get(_FOCAL_LENGTH))]
     return header._replace(
+        taken_with=tuple("" if one is None else str(one).strip("\0 ") for one in said) if any(said) else (),
         orientation=orientation if orientation in range(1, 9) else 1,
         focal_mm=_positive(details.get(_FOCAL_LENGTH)),
         focal_35mm=_positive(details.get(_FOCAL_LENGTH_35MM)),

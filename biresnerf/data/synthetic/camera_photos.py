@@ -40,6 +40,7 @@ class Maker:
         film: whether it says the focal length on 35 mm film, in whole millimetres.
         gps_m: standard deviation of the positions that it writes, and that it says; None: it has no GPS.
         gimbal: whether it writes the camera's attitude and the error of its RTK as XMP.
+        serial: the body's serial number, if it writes that.
         unit_m: metres in a unit of a scene that it photographs.
     """
 
@@ -54,6 +55,7 @@ class Maker:
     lens: str | None = None
     gps_m: float | None = None
     gimbal: bool = False
+    serial: str | None = None
     unit_m: float = 0.35
 
 
@@ -139,6 +141,8 @@ def _details(maker: Maker, number: int, taken: str, size: tuple[int, int], focal
         said[_EXIF.FocalLengthIn35mmFilm] = round(focal / math.hypot(*size) * FILM_DIAGONAL_MM)
     if maker.lens:
         said |= {_EXIF.LensModel: maker.lens, _EXIF.LensMake: maker.make}
+    if maker.serial:
+        said[_EXIF.BodySerialNumber] = maker.serial
     return {
         _EXIF.ExposureTime: IFDRational(1, 125),
         _EXIF.FNumber: IFDRational(28, 10),
