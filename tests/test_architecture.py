@@ -19,6 +19,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LINT_IMPORTS = Path(sys.executable).with_name("lint-imports")
 # What a package is imported as, where that is not what it is installed as.
 IMPORTED_AS = {
+    "opencv-python-headless": {"cv2"},
     "opentelemetry-sdk": {"opentelemetry"},
     "pillow": {"PIL"},
     "pydantic": {"pydantic", "pydantic_core"},  # its own, which it pins
@@ -190,7 +191,7 @@ def imported(package: str) -> dict[str, str]:
 @pytest.mark.parametrize(
     ("package", "extras"),
     [
-        ("biresnerf", ["client", "colmap", "photos", "studies", "view"]),
+        ("biresnerf", ["client", "colmap", "photos", "markers", "studies", "view"]),
         ("workers", ["service", "otel"]),
         ("service", ["service"]),
     ],

@@ -183,8 +183,8 @@ def compare_without_training(scene: Scene, refined: RefinedPoses, lost: int) -> 
 
 def _favoured_by_positions(
     dataset: Dataset, before: Rig, after: Rig, refined: Dataset, placed: NDArray[np.bool_]
-) -> int:
-    """The poses that measured places fit better beyond chance: 1 the refined ones, -1 the input's, 0 neither."""
+) -> Literal[-1, 0, 1] | None:
+    """The poses that measured places fit better: 1 the refined ones, -1 the input's; see `Findings`."""
     old = measured_evidence(dataset, before.world_from_cam, placed)
     new = measured_evidence(refined, after.world_from_cam, placed)
     if old.positions is None or new.positions is None:
@@ -195,8 +195,12 @@ def _favoured_by_positions(
         (Cameras.of(before.world_from_cam), replace(old, positions=new.positions)),
         (Cameras.of(after.world_from_cam), new),
     ]
-    votes = {int(alike[1]) - int(alike[0]) for _, alike in measured_misfits(rigs).values()} - {0}
-    return votes.pop() if len(votes) == 1 else 0
+    found = [alike for _, alike in measured_misfits(rigs).values()]
+    better, worse = any(not alike[0] for alike in found), any(not alike[1] for alike in found)
+    if better != worse:
+        return 1 if better else -1
+    stated = new.control is not None or (new.positions is not None and new.positions.stated)
+    return 0 if stated else None
 
 
 def motion(before: Array, after: Array) -> tuple[Array, Array]:

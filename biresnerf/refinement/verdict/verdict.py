@@ -42,7 +42,8 @@ class Findings:
         compared_with: where the input's poses come from.
         grounded: whether the input's poses are given ones or come from matches, and are not mere guesses.
         offset: whether an offset that all given poses shared was taken back.
-        favoured_by_positions: 1 where measured positions fit the refined poses better beyond chance, -1 the input's.
+        favoured_by_positions: 1 where measured places fit the refined poses better beyond chance, -1 the input's, 0
+            where neither, and their accuracy is stated; else None.
     """
 
     failed: tuple[str, ...]
@@ -55,7 +56,7 @@ class Findings:
     faults: tuple[str, ...] = ()
     working_share: float = 1.0
     offset: bool = False
-    favoured_by_positions: int = 0
+    favoured_by_positions: Literal[-1, 0, 1] | None = None
 
     @property
     def explained(self) -> bool:
@@ -102,9 +103,11 @@ def frame_doubt(turned_deg: Array, shifted: Array, spread: float) -> str:
 def decide(findings: Findings) -> Verdict:
     """The verdict by the rules of docs/verdict.md."""
     name, ground = _judge(findings)
-    # Where nothing speaks for either, poses that somebody gave stay, as do found ones while the evidence is weak; mere
-    # guesses do not, nor found ones that measure the same: left-out tracks and patches chose the refined ones.
+    # Where nothing speaks for either, poses that somebody gave stay, as do found ones while the evidence is weak. Mere
+    # guesses do not, nor found ones that measure the same: left-out tracks and patches chose the refined ones. Nor do
+    # found ones that heed no measured places, where nothing speaks against refined ones that do.
     yields = _measures_the_same(findings) if name == "unchanged" else not findings.grounded
+    yields = yields or _alone_heed_places(findings)
     keep = name != "improved" and not (name in ("unchanged", "inconclusive") and yields)
     return Verdict(
         verdict=name,
@@ -175,6 +178,12 @@ def _measures_the_same(f: Findings) -> bool:
     return f.compared_with == "seeded" and f.moved_px >= MEASURABLE_PX and both
 
 
+def _alone_heed_places(f: Findings) -> bool:
+    """Whether refined poses were adjusted to measured places, the others come from matches, and all speaks for both."""
+    heeded = f.favoured_by_positions is not None and not _against(f)
+    return heeded and f.compared_with == "seeded" and f.moved_px >= MEASURABLE_PX and not f.faults
+
+
 def _counted(f: Findings) -> list[PairedDifference]:
     """The comparisons that may speak for the refined poses."""
     counted = [f.heldout.psnr] if f.heldout is not None else []
@@ -190,7 +199,7 @@ def _for(f: Findings) -> list[str]:
         names.append(VIEWS)
     if f.favoured_by_matches > 0:
         names.append(MATCHES)
-    if f.favoured_by_positions > 0:
+    if f.favoured_by_positions == 1:
         names.append(POSITIONS)
     return names
 
@@ -216,7 +225,7 @@ def _against(f: Findings) -> list[str]:
         names.append(VIEWS)
     if f.favoured_by_matches < 0:
         names.append(MATCHES)
-    if f.favoured_by_positions < 0:
+    if f.favoured_by_positions == -1:
         names.append(POSITIONS)
     return names
 

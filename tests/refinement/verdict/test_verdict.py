@@ -155,6 +155,15 @@ def test_poses_that_nobody_gave_yield_to_refined_ones_that_measure_the_same():
     assert decide(alone).returned == "input"
 
 
+def test_found_poses_yield_to_refined_ones_that_heed_measured_places():
+    weak = findings(held_out(1.0, spread=3.0), compared_with="seeded")
+    heeding = replace(weak, favoured_by_positions=0)
+    assert [decide(each).returned for each in (weak, heeding)] == ["input", "refined"]
+    assert decide(heeding).verdict == "inconclusive"
+    for doubt in ({"compared_with": "given"}, {"faults": ("a fault",)}, {"favoured_by_positions": -1}):
+        assert decide(replace(heeding, **doubt)).returned == "input"
+
+
 def test_without_evidence_refined_poses_stand_only_against_a_guess():
     assert decide(findings(grounded=False)).returned == "refined"
     assert decide(findings(held_out(-4.0), grounded=False)).returned == "input"

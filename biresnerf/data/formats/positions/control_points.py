@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from biresnerf.data.formats.match_names import match_files
+from biresnerf.data.formats.positions.markers import is_marker, marked, refuse_without_opencv
 from biresnerf.data.formats.positions.position_table import WGS84, frame_of
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.measured_places import ControlPoints
@@ -52,12 +53,12 @@ def control_points(dataset: Dataset) -> ControlPoints | None:
     """Those that two photos of the set show, of the first file beside the photos; None without such a file or point.
 
     Raises:
-        InputError: ``control_points_invalid``, with the line.
+        InputError: ``control_points_invalid``, with the line; or a code of `decode`, where it names markers.
     """
     file = next(iter(control_files(dataset.root)), None)
     if dataset.control is not None or file is None:
         return dataset.control
-    rows, degrees, epsg = (_of_csv if file.suffix.lower() == ".csv" else _of_odm)(file)
+    rows, degrees, epsg = _rows_of(file)
     found, _ = match_files(list(dict.fromkeys(row.image for row in rows if row.image)), dataset.file_names)
     frame = {name: dataset.file_names.index(known) for name, known in found.items()}
     names = list(dict.fromkeys(row.name for row in rows))
@@ -66,6 +67,8 @@ def control_points(dataset: Dataset) -> ControlPoints | None:
         if row.place != first[names.index(row.name)].place:
             raise _invalid(row.where, f"has other coordinates of {row.name[:100]!r} than a line before.")
     seen = {(names.index(row.name), frame[row.image]): row.xy for row in rows if row.image in frame}
+    if markers := _markers(rows):
+        seen |= {(names.index(name), at): xy for (name, at), xy in marked(dataset, markers).items()}
     if not seen:
         return None
     places, origin = np.array([row.place for row in first]), None
@@ -83,17 +86,36 @@ def control_points(dataset: Dataset) -> ControlPoints | None:
 
 
 def control_notes(dataset: Dataset) -> tuple[str, ...]:
-    """A note on what the file beside the photos holds. Raises InputError ``control_points_invalid``."""
-    files, points = control_files(dataset.root), control_points(dataset)
-    if not files:
+    """A note on what the file beside the photos holds.
+
+    Raises:
+        InputError: ``control_points_invalid``, or ``markers_unsupported``.
+    """
+    file = next(iter(control_files(dataset.root)), None)
+    if file is None:
         return ()
+    if markers := _markers(_rows_of(file)[0]):  # finding them takes a while
+        refuse_without_opencv(file.name)
+        return (f"{file.name}: {len(markers)} printed markers are looked for in the photos",)
+    points = control_points(dataset)
     if points is None:
-        return (f"{files[0].name}: no control point is seen in two photos of the set; it is not used",)
+        return (f"{file.name}: no control point is seen in two photos of the set; it is not used",)
     checks = int(points.check.sum())
     return (
         f"{points.source}: {len(points.names) - checks} control points and {checks} check points in "
         f"{len(np.unique(points.image))} photos",
     )
+
+
+def _markers(rows: list[_Row]) -> list[str]:
+    """Names of markers that no row says where to see."""
+    shown = {row.name for row in rows if row.image}
+    return [row.name for row in rows if row.name not in shown and is_marker(row.name)]
+
+
+def _rows_of(file: Path) -> tuple[list[_Row], bool, int | None]:
+    """The rows, whether their places are latitude, longitude and height, and EPSG's number of the frame."""
+    return _of_csv(file) if file.suffix.lower() == ".csv" else _of_odm(file)
 
 
 def _of_odm(file: Path) -> tuple[list[_Row], bool, int | None]:
