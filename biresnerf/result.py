@@ -28,6 +28,7 @@ from biresnerf.data.show.history import HISTORY, read_history
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.pose_error import rotation_between_deg
+from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.options.formats import formats
 from biresnerf.report import Report, Verdict
 from biresnerf.viewer.report_html import read_report
@@ -85,6 +86,16 @@ class Result:
     def moved(self) -> Array:
         """The distance [n] between each camera's centre before and the returned one, in the input's unit."""
         return np.asarray(np.linalg.norm(self.poses[:, :3, 3] - self.poses_before[:, :3, 3], axis=1))
+
+    @property
+    def poses_of_body(self) -> Array | None:
+        """world_from_body [n, 4, 4] of what carries the camera, a robot's flange or a phone, by the refined poses.
+
+        As the input has them, where its poses were those of such a body (`input_accuracy.body_from_camera` in the
+        report); None where no offset was found.
+        """
+        found = self.report.input_accuracy and self.report.input_accuracy.body_from_camera
+        return None if found is None else self.poses_refined @ rigid_inverse(np.array(found))
 
     def to_colmap(self, folder: str | Path) -> Path:
         """Write the returned poses as a binary COLMAP model into `folder`, new or empty; returns it."""

@@ -68,6 +68,21 @@ def test_arrays_are_those_of_the_result(written):
     np.testing.assert_array_equal(result.history["odd"], [np.nan, 1.0])
 
 
+def test_poses_of_the_body_that_carries_the_camera_follow_from_those_of_the_camera(written):
+    _refined, folder = written
+    assert biresnerf.load(folder).poses_of_body is None
+    body_from_cam = np.array([[0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1.0]])
+    report = json.loads((folder / "report.json").read_text())
+    report["input_accuracy"] = {
+        "rotation_deg": 0.1,
+        "position": 0.01,
+        "body_from_camera": body_from_cam.tolist(),
+    }
+    (folder / "report.json").write_text(json.dumps(report))
+    result = biresnerf.load(folder)
+    np.testing.assert_allclose(result.poses_of_body @ body_from_cam, result.poses_refined, atol=1e-12)
+
+
 def test_an_image_without_a_pose_before_has_none(written):
     refined, folder = written
     result = biresnerf.load(folder)
