@@ -14,6 +14,7 @@ from biresnerf.data.formats.codec import WriteContext
 from biresnerf.data.formats.colmap.read_model import read_colmap_model
 from biresnerf.data.formats.positions.position_priors import position_priors
 from biresnerf.data.formats.read_dataset import read_dataset, read_poses
+from biresnerf.data.formats.registry import ALL_CODECS
 from biresnerf.data.formats.result_formats import read_result, write_result_formats
 from biresnerf.data.model.colmap_scene import matrix_of_pose
 from biresnerf.data.model.dataset import Dataset
@@ -25,6 +26,7 @@ from biresnerf.data.seeding.seed_poses import seed_poses
 from biresnerf.data.synthetic.captures import TABLE_SCENE, table_textures, write_panoramas
 from biresnerf.data.synthetic.scene import render_shapes
 from biresnerf.errors import InputError
+from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import pose_error
 from biresnerf.geometry.rigid import rigid_inverse
@@ -162,6 +164,39 @@ def test_poses_that_did_not_move_keep_their_digits(made, tmp_path):
     assert [frame["transform_matrix"] for frame in after["frames"]] == [
         frame["transform_matrix"] for frame in before["frames"]
     ]
+
+
+def spherical_opensfm(document):
+    document[0]["cameras"]["0"] = {"projection_type": "spherical", "width": WIDTH, "height": WIDTH // 2}
+
+
+def spherical_openmvg(document):
+    lens = document["intrinsics"][0]["value"]
+    lens["polymorphic_name"] = "spherical"
+    lens["ptr_wrapper"]["data"] = {"width": WIDTH, "height": WIDTH // 2}
+
+
+def spherical_meshroom(document):
+    document["intrinsics"][0]["type"] = "equirectangular"
+
+
+@pytest.mark.parametrize("name", ["opensfm", "openmvg", "meshroom"])
+def test_spherical_cameras_of_other_programs_are_read_with_their_poses(made, tmp_path, name):
+    given = read_dataset(made)
+    plain = Camera("PINHOLE", WIDTH, WIDTH // 2, (100.0, 100.0, WIDTH / 2, WIDTH / 4))
+    codec = ALL_CODECS[name]
+    path = tmp_path / codec.format.in_set
+    refined = refined_set(replace(given, cameras=(plain,)), given.world_from_cam)
+    codec.write_set(refined, path, WriteContext())
+    document = json.loads(path.read_text())
+    {"opensfm": spherical_opensfm, "openmvg": spherical_openmvg, "meshroom": spherical_meshroom}[name](
+        document
+    )
+    path.write_text(json.dumps(document))
+    (tmp_path / "images").symlink_to(made / "images")
+    read = read_dataset(path)
+    assert [camera.model for camera in read.cameras] == ["EQUIRECTANGULAR"]
+    np.testing.assert_allclose(read.world_from_cam, given.world_from_cam, atol=1e-9)
 
 
 @pytest.mark.slow
