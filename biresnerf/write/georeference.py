@@ -34,7 +34,9 @@ def write_georeference(
     if priors is None:
         return None
     try:
-        fit = fit_positions(world_from_cam[priors.rows], priors.positions_m, priors.accuracy_m)
+        fit = fit_positions(
+            world_from_cam[priors.rows], priors.positions_m, priors.accuracy_m, priors.rotations
+        )
     except NoGeoreference as reason:
         return _reference(priors).model_copy(update={"why_not": str(reason)})
     found = _with_fit(_reference(priors), priors, fit, dataset.names)

@@ -19,6 +19,8 @@ class PositionPriors:
         accuracy_m: float64 [m, 3], standard deviations along the axes; NaN where they are not said.
         origin: latitude, longitude (degrees) and height (m), the median of all; None for a frame of the source's own.
         epsg: EPSG's number of the origin's coordinates, or of the source's frame; None where it is not known.
+        rotations: float64 [m, 3, 3], from the cameras' axes to those of the positions, as a drone's gimbal has them;
+            None where some photo does not say.
     """
 
     source: str
@@ -27,12 +29,17 @@ class PositionPriors:
     accuracy_m: NDArray[np.float64]
     origin: tuple[float, float, float] | None
     epsg: int | None
+    rotations: NDArray[np.float64] | None = None
 
     def of(self, frames: NDArray[np.bool_]) -> PositionPriors:
         """Those of these frames [n] alone, with the same origin."""
         kept = frames[self.rows]
         return replace(
-            self, rows=self.rows[kept], positions_m=self.positions_m[kept], accuracy_m=self.accuracy_m[kept]
+            self,
+            rows=self.rows[kept],
+            positions_m=self.positions_m[kept],
+            accuracy_m=self.accuracy_m[kept],
+            rotations=None if self.rotations is None else self.rotations[kept],
         )
 
 

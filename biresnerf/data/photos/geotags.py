@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from PIL import Image
 
-from biresnerf.data.photos.image_files import from_exif, open_image, quiet_pillow
+from biresnerf.data.photos.image_files import EXIF_ORIENTATION, from_exif, open_image, quiet_pillow
 from biresnerf.data.photos.kinds.xmp import xmp, xmp_number
 
 _GPS_IFD = 0x8825
@@ -22,6 +22,7 @@ _ACCURACY = (
     ("drone-dji:RtkStdLat", "Camera:GPSXYAccuracy"),
     ("drone-dji:RtkStdHgt", "Camera:GPSZAccuracy"),
 )
+_ANGLES = ("drone-dji:GimbalYawDegree", "drone-dji:GimbalPitchDegree", "drone-dji:GimbalRollDegree")
 _RTK = "drone-dji:RtkFlag"  # 0: none, 16: of one receiver, 34: float, 50: fixed
 
 
@@ -31,10 +32,13 @@ class MeasuredPlace(NamedTuple):
     Attributes:
         place: latitude, longitude (degrees, north and east above zero) and height (m); or x, y, z (m).
         accuracy_m: standard deviations along east, north and up, or x, y and z; None where they are not said.
+        angles_deg: of the camera, as a drone's gimbal has them: yaw from north over east, pitch above the horizon, and
+            roll to the right; None where they are not said.
     """
 
     place: tuple[float, float, float]
     accuracy_m: tuple[float, float, float] | None = None
+    angles_deg: tuple[float, float, float] | None = None
 
 
 def read_geotag(path: Path, name: str) -> MeasuredPlace | None:
@@ -45,8 +49,13 @@ def read_geotag(path: Path, name: str) -> MeasuredPlace | None:
     """
     with quiet_pillow(), open_image(path, name) as image:
         place = from_exif(image, _place)
-        stated = None if place is None else _of_drone(xmp(image))
-    return place if place is None or stated is None else place._replace(accuracy_m=stated)
+        text, upright = xmp(image), from_exif(image, lambda exif: exif.get(EXIF_ORIENTATION, 1) == 1)
+    if place is None:
+        return None
+    yaw, pitch, roll = (xmp_number(text, name) for name in _ANGLES)
+    if upright is not False and yaw is not None and pitch is not None and roll is not None:
+        place = place._replace(angles_deg=(yaw, pitch, roll))
+    return place._replace(accuracy_m=_of_drone(text) or place.accuracy_m)
 
 
 def _of_drone(text: bytes) -> tuple[float, float, float] | None:

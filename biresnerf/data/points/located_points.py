@@ -86,7 +86,9 @@ def metres_from_world(
     if dataset.positions is not None:
         priors = dataset.positions.of(counted)
         try:
-            return fit_positions(world_from_cam[priors.rows], priors.positions_m).metres_from_world
+            return fit_positions(
+                world_from_cam[priors.rows], priors.positions_m, rotations=priors.rotations
+            ).metres_from_world
         except NoGeoreference as reason:
             logger.info("%s gives no frame: %s", priors.source, reason)
     return None

@@ -45,6 +45,25 @@ def place_of(enu_m: Array, origin: Array) -> Array:
     return np.stack([np.degrees(latitude), np.degrees(np.arctan2(y, x)), height], -1)
 
 
+def held_so(angles_deg: Array) -> Array:
+    """Rotations [m, 3, 3] from a camera's axes to east, north and up, of a gimbal's angles [m, 3].
+
+    Yaw is from north over east, pitch above the horizon, roll to the right (clockwise as the camera sees it).
+    """
+    yaw, pitch, roll = np.radians(angles_deg).T
+    level = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # north, with the right side east
+    return np.asarray(_about(2, -yaw) @ _about(0, pitch) @ level @ _about(2, roll))
+
+
+def _about(axis: int, angle: Array) -> Array:
+    """Rotations [m, 3, 3] about one of the axes, rad."""
+    one, other = (axis + 1) % 3, (axis + 2) % 3
+    turn = np.tile(np.eye(3), (len(angle), 1, 1))
+    turn[:, one, one] = turn[:, other, other] = np.cos(angle)
+    turn[:, one, other], turn[:, other, one] = -np.sin(angle), np.sin(angle)
+    return turn
+
+
 def _axes(origin: Array) -> Array:
     """East, north and up at a place, as rows in earth-centred coordinates."""
     latitude, longitude = np.radians(origin[:2])

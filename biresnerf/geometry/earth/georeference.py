@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.geometry.similarity import Similarity, align_robust
 
 Array = NDArray[np.float64]
@@ -16,6 +17,7 @@ Array = NDArray[np.float64]
 # number.
 LEAST_POSITIONS, MOST_SCATTER = 6, 0.2
 FARTHEST = 10  # median distances from the middle: a position beyond is wrong
+LINE, MOST_TURNED_DEG = 0.05, 10.0  # positions so near a line leave its turn to angles, which may err so far
 THINNEST = 1e-3  # of the spread along the first axis, the least along the second
 # The median distance of three normal deviates, and how many times the distance that the stated accuracy would give
 # positions may be away.
@@ -43,13 +45,20 @@ class NoGeoreference(ValueError):
     """Positions that tell no frame; the message says why, in a user's words."""
 
 
-def fit_positions(world_from_cam: Array, positions_m: Array, accuracy_m: Array | None = None) -> Georeference:
+def fit_positions(
+    world_from_cam: Array,
+    positions_m: Array,
+    accuracy_m: Array | None = None,
+    rotations: Array | None = None,
+) -> Georeference:
     """The similarity from cameras [m, 4, 4] to their measured positions [m, 3], robust to wrong ones.
 
     Args:
         world_from_cam: the cameras.
         positions_m: in metres, in any frame.
         accuracy_m: stated standard deviations of the positions along the axes [m, 3], NaN where they are not known.
+        rotations: of the cameras in the frame of the positions [m, 3, 3], as a gimbal measured them; they tell the turn
+            about a line.
 
     Raises:
         NoGeoreference: too few positions; or all on a line, or scattered as far as they spread, so that a turn is open.
@@ -67,11 +76,13 @@ def fit_positions(world_from_cam: Array, positions_m: Array, accuracy_m: Array |
         metres_from_world = align_robust(world_from_cam[used], there[used])
     except ValueError:
         raise NoGeoreference("the cameras are at one place") from None
+    if rotations is not None and _spread(there[used][:, :3, 3])[1] < LINE * _spread(there[used][:, :3, 3])[0]:
+        return _along_a_line(world_from_cam, there, rotations, used, accuracy_m)
     found = metres_from_world.apply_to_poses(world_from_cam)[:, :3, 3]
     apart = np.linalg.norm(found - positions_m, axis=1)
     residual = float(np.median(apart[used]))
     near = found[used & (apart <= 3 * residual)]
-    spread = np.linalg.svd(near - near.mean(0), compute_uv=False)[:2] / len(near) ** 0.5
+    spread = _spread(near)
     if not spread[1] > THINNEST * spread[0]:
         raise NoGeoreference("the cameras lie on a line, about which the positions leave the turn open")
     if not residual < MOST_SCATTER * spread[1]:  # neither where both are zero
@@ -80,6 +91,31 @@ def fit_positions(world_from_cam: Array, positions_m: Array, accuracy_m: Array |
         )
     doubt = "" if accuracy_m is None else _doubt(apart[used], accuracy_m[used])
     return Georeference(metres_from_world, used, apart, doubt)
+
+
+def _along_a_line(
+    world_from_cam: Array, there: Array, rotations: Array, used: NDArray[np.bool_], accuracy_m: Array | None
+) -> Georeference:
+    """The similarity of cameras on a line, about which rotations [m, 3, 3] tell the turn."""
+    there[:, :3, :3] = rotations
+    found = align_robust(world_from_cam[used], there[used], with_rotations=True)
+    moved = found.apply_to_poses(world_from_cam)
+    turned = float(np.median(rotation_between_deg(moved[used], there[used])))
+    apart = np.linalg.norm(moved[:, :3, 3] - there[:, :3, 3], axis=1)
+    if (
+        turned > MOST_TURNED_DEG
+        or float(np.median(apart[used])) > MOST_SCATTER * _spread(there[used][:, :3, 3])[0]
+    ):
+        raise NoGeoreference(
+            f"the cameras lie on a line, and the gimbal's angles are {turned:.2g} degrees from theirs"
+        )
+    doubt = "" if accuracy_m is None else _doubt(apart[used], accuracy_m[used])
+    return Georeference(found, used, apart, doubt)
+
+
+def _spread(points: Array) -> Array:
+    """Root mean squares along the first two axes of points [m, 3]."""
+    return np.asarray(np.linalg.svd(points - points.mean(0), compute_uv=False)[:2] / len(points) ** 0.5)
 
 
 def _doubt(apart_m: Array, accuracy_m: Array) -> str:

@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 
 from biresnerf.data.photos.geotags import read_geotag
+from biresnerf.geometry.earth.geodesy import held_so
 from tests.data.photos.geotagged import geotag, write_geotagged
 
 
@@ -59,3 +60,25 @@ def test_the_accuracy_that_a_drone_states_is_read(tmp_path, text, accuracy):
     path = tmp_path / "photo.jpg"
     Image.new("RGB", (16, 16)).save(path, exif=geotag(48.0, 2.0, 100.0), xmp=text.encode())
     assert read_geotag(path, path.name).accuracy_m == accuracy
+
+
+@pytest.mark.parametrize(
+    ("angles", "right", "forward"),
+    [
+        ((0, 0, 0), (1, 0, 0), (0, 1, 0)),  # level, to the north
+        ((90, 0, 0), (0, -1, 0), (1, 0, 0)),  # to the east: south is on the right
+        ((0, -90, 0), (1, 0, 0), (0, 0, -1)),  # straight down, with north on top
+        ((90, -90, 0), (0, -1, 0), (0, 0, -1)),  # with east on top
+        ((0, 0, 90), (0, 0, -1), (0, 1, 0)),  # on its right side
+    ],
+)
+def test_a_gimbals_angles_are_a_rotation(tmp_path, angles, right, forward):
+    text = " ".join(
+        f'drone-dji:Gimbal{name}Degree="{angle:+.2f}"'
+        for name, angle in zip(("Yaw", "Pitch", "Roll"), angles, strict=True)
+    )
+    path = tmp_path / "photo.jpg"
+    Image.new("RGB", (16, 16)).save(path, exif=geotag(48.0, 2.0, 100.0), xmp=text.encode())
+    assert read_geotag(path, path.name).angles_deg == angles
+    (rotation,) = held_so(np.array([angles], dtype=float))
+    np.testing.assert_allclose(rotation[:, [0, 2]].T, [right, forward], atol=1e-12)

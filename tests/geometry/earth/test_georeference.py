@@ -75,3 +75,15 @@ def test_an_accuracy_that_the_residuals_contradict_is_doubted_and_the_frame_is_k
     assert "accuracy of 0.05 m is not believed" in doubted.doubt
     assert doubted.metres_from_world.scale * WORLD_FROM_METRES.scale == pytest.approx(1, abs=0.05)
     assert not fit_positions(world, positions, np.full((COUNT, 3), 1.5)).doubt
+
+
+def test_a_gimbals_angles_tell_the_turn_about_a_line_unless_they_contradict_the_cameras():
+    line = cameras_m(flat=0.0)
+    world, positions = WORLD_FROM_METRES.apply_to_poses(line), measured(line, 0.5)
+    off = Rotation.from_rotvec(np.random.default_rng(5).normal(0, 0.02, (COUNT, 3))).as_matrix()
+    fit = fit_positions(world, positions, rotations=off @ line[:, :3, :3])
+    back = fit.metres_from_world.apply_to_poses(world)
+    assert rotation_between_deg(back, line).max() < 1.5
+    assert np.abs(back[:, :3, 3] - line[:, :3, 3]).max() < 1.0
+    with pytest.raises(NoGeoreference, match="gimbal"):
+        fit_positions(world, positions, rotations=Rotation.random(COUNT, random_state=7).as_matrix())

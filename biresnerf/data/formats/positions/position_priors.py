@@ -21,7 +21,7 @@ from biresnerf.data.model.measured_places import PositionPriors
 from biresnerf.data.model.untrusted_file import read_text
 from biresnerf.data.photos.geotags import MeasuredPlace, read_geotag
 from biresnerf.errors import InputError
-from biresnerf.geometry.earth.geodesy import east_north_up
+from biresnerf.geometry.earth.geodesy import east_north_up, held_so
 
 
 def position_priors(dataset: Dataset) -> PositionPriors | None:
@@ -108,6 +108,8 @@ def _priors(
         return PositionPriors(source, rows, places, accuracy, None, epsg)
     origin = np.median(places, axis=0)
     latitude, longitude, height = origin.tolist()
+    angles = [place.angles_deg for place in found.values() if place.angles_deg is not None]
+    rotations = held_so(np.array(angles)) if len(angles) == len(places) else None
     return PositionPriors(
-        source, rows, east_north_up(places, origin), accuracy, (latitude, longitude, height), epsg
+        source, rows, east_north_up(places, origin), accuracy, (latitude, longitude, height), epsg, rotations
     )

@@ -122,8 +122,8 @@ def _geo_txt(source: str, lines: Sequence[str], first: int) -> PositionTable:
         texts = [y, x, z] if degrees else [x, y, z]
         stated = cells[_ODM_ACCURACY : _ODM_ACCURACY + 2]
         _add(places, cells[0], texts, stated, where, degrees=degrees)
-        (a, b, c), accuracy = places[cells[0]]
-        places[cells[0]] = MeasuredPlace((a * metres, b * metres, c), accuracy)
+        a, b, c = places[cells[0]].place
+        places[cells[0]] = places[cells[0]]._replace(place=(a * metres, b * metres, c))
     notes: tuple[str, ...] = ()
     if flat:
         notes = (f"{source} line {flat[0]} has no height: {len(flat)} positions without one are not used",)
