@@ -122,7 +122,7 @@ def test_normal_equations_are_those_of_autograd(rng, correction):
     unknown = torch.zeros(cameras.unknowns, dtype=torch.float64)
     scale = torch.ones(count, dtype=torch.float64)
     r = residuals(unknown, scale)
-    to_cameras, to_scale = torch.autograd.functional.jacobian(residuals, (unknown, scale))
+    to_cameras, to_scale = torch.autograd.functional.jacobian(residuals, (unknown, scale), vectorize=True)
     square = torch.from_numpy(term.squares(cameras, np.ones(count)))
     variance = (r**2).mean(1) / square
     assert (variance >= PIXEL_NOISE**2).all()
