@@ -48,7 +48,7 @@ from biresnerf.options.formats import Format
 FEED_FORWARD = Format(
     name="feed-forward",
     title="VGGT, Depth Anything 3",
-    rank=93,
+    rank=96,
     found_as=("predictions.npz", "results.npz", "exports/npz/results.npz", "exports/mini_npz/results.npz"),
     suffixes=(".npz",),
     gives="poses; lenses as first guesses, carried from the scaled pictures to the photos",
@@ -58,7 +58,7 @@ FEED_FORWARD = Format(
 DUST3R = Format(
     name="dust3r",
     title="DUSt3R, MASt3R",
-    rank=94,
+    rank=97,
     found_as=("poses.npz", "poses.npy", "camera_poses.npy", "cams2world.npy"),
     suffixes=(".npz", ".npy"),
     gives="poses, with focals.npy, intrinsics.npy or pps.npy beside them; lenses as VGGT's",
