@@ -47,6 +47,7 @@ class Format:
             camera.json beside it, as it has no lenses; ``bounds``: depths of the nearest and farthest point; ``input``:
             the input's own file.
         loses: what of a set it cannot hold.
+        panoramas: it holds lenses of panoramas.
         splats: programs that train splats start from its points.
         instead: the format that is written in its place where it cannot hold the set's lenses.
         lacks: more that it cannot hold, in words, for the docs.
@@ -71,6 +72,7 @@ class Format:
     always: bool = False
     needs: tuple[Need, ...] = ()
     loses: tuple[Loss, ...] = ()
+    panoramas: bool = False
     splats: bool = False
     instead: str = ""
     lacks: str = ""

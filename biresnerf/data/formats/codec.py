@@ -88,7 +88,7 @@ class Codec:
 
     def write_set(self, refined: RefinedSet, path: Path, context: WriteContext) -> None:
         """Write the set. Raises InputError ``export_not_possible`` where the format cannot hold it."""
-        holds = self.format.name == "transforms" or "lenses" in self.format.loses
+        holds = self.format.panoramas or "lenses" in self.format.loses
         if not holds and any(camera.panorama for camera in refined.cameras):
             raise InputError(
                 "export_not_possible",

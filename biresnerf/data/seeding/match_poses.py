@@ -104,8 +104,7 @@ def in_measured_frame(matched: MatchedPoses, dataset: Dataset) -> MatchedPoses:
     Raises:
         InputError: ``positions_invalid``, or a code of `open_image`.
     """
-    if dataset.positions is None:
-        dataset = replace(dataset, positions=position_priors(dataset))
+    dataset = replace(dataset, positions=position_priors(dataset))
     frame = metres_from_world(dataset, matched.world_from_cam, matched.placed)
     if frame is None:
         return matched

@@ -26,6 +26,7 @@ TRANSFORMS = Format(
     name="transforms",
     title="transforms.json (nerfstudio, instant-ngp, Blender)",
     rank=10,
+    panoramas=True,
     found_as=("transforms.json", "transforms_train.json", "transform.json", "transform_train.json"),
     suffixes=(".json",),
     gives="poses (also for some images only), shared or per-frame intrinsics, masks",
