@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import signal
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 
@@ -52,6 +53,7 @@ from workers.settings.traces import flush_traces
 logger = logging.getLogger(__name__)
 
 _UNFINISHED_EVERY_S = 15.0
+_BROKEN_S = 30.0  # probes of /livez see it first
 _RESOURCES = (
     datasets,
     photos,
@@ -94,6 +96,7 @@ def create_app(settings: Settings) -> FastAPI:
             service.keep_running(_repeat(finish_uploads, service))
             # Workers do the same; without any, trash and tallies would pile up.
             service.keep_running(stores.janitor.run())
+            service.keep_running(_stop_if_broken(service))
             await log_access(service)
             try:
                 yield
@@ -144,6 +147,13 @@ async def _repeat(work: Callable[[Service], Awaitable[None]], service: Service) 
         except Exception:
             logger.exception("%s failed; it will be retried", work.__name__)
         await asyncio.sleep(_UNFINISHED_EVERY_S)
+
+
+async def _stop_if_broken(service: Service) -> None:
+    """Stops the process once it lost its connections to the database, for what restarts only processes that ended."""
+    await service.stores.monitor.broken.wait()
+    await asyncio.sleep(_BROKEN_S)
+    signal.raise_signal(signal.SIGTERM)
 
 
 async def finish_checks(service: Service) -> None:

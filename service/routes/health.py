@@ -21,9 +21,16 @@ _NEEDS: tuple[Need, ...] = ("database", "storage", "queue")  # what the others d
 _LACKING = (*(f"{need}_unavailable" for need in _NEEDS), "unavailable")
 
 
-@router.get("/livez")
-async def livez() -> Health:
-    """The process runs and responds. Its dependencies are not checked: a restart would not repair them."""
+@router.get("/livez", responses=declared("unavailable"))
+async def livez(service: CurrentService) -> Health:
+    """The process runs and responds. Its dependencies are not checked: a restart would not repair them.
+
+    503 where it lost connections to a database that answers: a restart repairs that.
+    """
+    if service.stores.monitor.broken.is_set():
+        raise ProblemError(
+            "unavailable", "The process lost its connections to the database and has to restart."
+        )
     return Health()
 
 

@@ -16,6 +16,7 @@ from psycopg.rows import DictRow, dict_row
 from psycopg.sql import SQL, Composed
 from psycopg_pool import AsyncConnectionPool, PoolClosed, PoolTimeout
 
+from workers.database.whole_pool import WholePool
 from workers.settings.errors import NotFound, SetupError, Unavailable
 
 log = logging.getLogger(__name__)
@@ -35,6 +36,8 @@ CONNECT: dict[str, Any] = {
     "tcp_user_timeout": 60_000,
 }
 RECONNECT_S = 1.0
+# A pool that replaces connections lacks them for seconds.
+LOOK_S, LOOKS = 1.0, 90
 
 
 P = ParamSpec("P")
@@ -73,10 +76,15 @@ class Connection(psycopg.AsyncConnection[DictRow]):
 
 
 class Database:
-    """One process's pool of connections. Use `open_database`."""
+    """One process's pool of connections. Use `open_database`.
+
+    Attributes:
+        broken: set once the pool lost connections for good although the database answers: a restart mends it.
+    """
 
     def __init__(self, url: str, pool: AsyncConnectionPool[Connection], answer_s: float) -> None:
         self.url, self.pool, self._answer_s = url, pool, answer_s
+        self.broken = asyncio.Event()
 
     @asynccontextmanager
     async def transaction(self) -> AsyncIterator[Connection]:
@@ -85,8 +93,12 @@ class Database:
         Also where it takes longer than it may: a connection can fall silent without an end.
         """
         try:
-            async with asyncio.timeout(self._answer_s), self.pool.connection() as connection:
-                yield connection
+            # The return lies outside the limit: what was committed is not "too late".
+            async with contextlib.AsyncExitStack() as at_end, asyncio.timeout(self._answer_s):
+                connection = await self.pool.getconn()
+                at_end.push_async_callback(self.pool.putconn, connection)
+                async with connection:
+                    yield connection
         except TimeoutError as error:
             await self.pool.drain()  # where one line is dead the others are, and each would cost as long
             raise Unavailable(
@@ -154,7 +166,7 @@ async def open_database(
         )
         await connection.commit()
 
-    pool: AsyncConnectionPool[Connection] = AsyncConnectionPool(
+    pool: WholePool[Connection] = WholePool(
         url,
         min_size=1,
         max_size=connections,
@@ -165,10 +177,8 @@ async def open_database(
         kwargs={"row_factory": dict_row, **CONNECT},
         connection_class=Connection,
         configure=end_if_silent,
-        check=AsyncConnectionPool.check_connection,  # connections killed with the server are replaced unseen
         open=False,
     )
-    logging.getLogger("psycopg.pool").setLevel(logging.ERROR)  # it warns at every reconnect attempt
     try:
         await pool.open(wait=True, timeout=opening_s)
     except PoolTimeout:
@@ -179,9 +189,38 @@ async def open_database(
     try:
         database = Database(url, pool, answer_s)
         await _require_schema(database)
-        yield database
+        watching = asyncio.create_task(_watch(database, pool))
+        try:
+            yield database
+        finally:
+            watching.cancel()
     finally:
         await pool.close()
+
+
+async def _watch(database: Database, pool: WholePool[Connection]) -> None:
+    """Sets ``database.broken`` where the pool lacks connections all the time and a fresh one works."""
+    in_vain = 0  # looks, not seconds: a frozen process did not look
+    while True:
+        await asyncio.sleep(LOOK_S)
+        in_vain = in_vain + 1 if pool.lost() > 0 else 0
+        if in_vain >= LOOKS and await _answers(database.url):
+            log.critical(
+                "the pool lost %d of its connections to the database, which answers; only a restart helps",
+                pool.lost(),
+            )
+            database.broken.set()
+            return
+
+
+async def _answers(url: str) -> bool:
+    """Whether a connection beside the pool works."""
+    try:
+        async with await psycopg.AsyncConnection.connect(url, **CONNECT) as fresh:
+            await fresh.execute("SELECT 1")
+    except AWAY:
+        return False
+    return True
 
 
 async def _keep_trying(pool: AsyncConnectionPool[Connection]) -> None:

@@ -15,5 +15,5 @@ class ExitStatus(IntEnum):
     JOB_CANCELLED = 12
     STOPPED = 13  # SIGTERM or SIGINT: the job is back in the queue, and the attempt does not count
     GIVEN_BACK = 14  # the attempt crashed, or disk or store were not there: the job is back in the queue
-    STUCK = 70  # the event loop did nothing for a minute
+    STUCK = 70  # the event loop did nothing for a minute, or connections to the database were lost
     FENCED = 75  # the job has another owner

@@ -36,6 +36,22 @@ async def end_if_hung(stuck_s: float = STUCK_S) -> AsyncIterator[None]:
         ticking.cancel()
 
 
+@contextlib.asynccontextmanager
+async def end_if_broken(broken: asyncio.Event) -> AsyncIterator[None]:
+    """While inside, the process ends with `ExitStatus.STUCK` once ``broken`` is set, which nothing else mends."""
+
+    async def end() -> None:
+        await broken.wait()
+        log.critical("the process cannot go on; exiting")
+        os._exit(ExitStatus.STUCK)
+
+    waiting = asyncio.create_task(end())
+    try:
+        yield
+    finally:
+        waiting.cancel()
+
+
 def run_process(name: str, work: Callable[[Settings], Awaitable[ExitStatus]]) -> ExitStatus:
     """Run ``work``, which tells the exit status, with the settings of the environment."""
     settings = Settings()

@@ -22,7 +22,7 @@ from workers.database.notifications import Listener
 from workers.database.statistics import announce_slot
 from workers.process.exit_status import ExitStatus
 from workers.process.waiting import first_done, retry_while_unavailable
-from workers.process.watchdog import run_process
+from workers.process.watchdog import end_if_broken, run_process
 from workers.queue.heartbeat import Heartbeat
 from workers.queue.janitor import Janitor, release_worker
 from workers.queue.lane import Lane, Workplace
@@ -85,7 +85,7 @@ class Slot:
                     lambda: release_worker(database, predecessor, self._settings.stall_s)
                 )
             await require_same_store(database, self._files)
-            async with self._registered(database) as worker_id:
+            async with end_if_broken(database.broken), self._registered(database) as worker_id:
                 listener = Listener(
                     database, self._settings.poll_s, *job_queue.CHANNELS, subject_of=job_queue.subject_of
                 )

@@ -39,7 +39,9 @@ _SECRETS = (
 )
 _HIDDEN_LENGTH_MIN = 6
 # Libraries that log addresses with secrets in them, or log our own outcomes a second time.
-_QUIET = {"httpx": logging.WARNING, "httpcore": logging.WARNING, "psycopg.pool": logging.ERROR}
+_QUIET = {"httpx": logging.WARNING, "httpcore": logging.WARNING, "psycopg.pool": logging.WARNING}
+# While the database is away its pool says so at each attempt.
+_REPEATING, _REPEAT_S = "psycopg.pool", 60.0
 
 
 @contextlib.contextmanager
@@ -63,6 +65,7 @@ def set_up_logging(process: str, settings: Settings) -> None:
     logging.captureWarnings(True)
     for name, level in _QUIET.items():
         logging.getLogger(name).setLevel(level)
+    logging.getLogger(_REPEATING).addFilter(OncePerMinute())
     sys.excepthook = _log_uncaught
 
 
@@ -74,6 +77,22 @@ def escaped(text: str) -> str:
 def _with_context(record: logging.LogRecord) -> bool:
     record.context = {**_CONTEXT.get(), **getattr(record, "fields", {})}
     return True
+
+
+class OncePerMinute(logging.Filter):
+    """Lets each kind of record pass once a minute."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._passed: dict[str, float] = {}
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether no record with the same text, before its values are filled in, passed in the last minute."""
+        kind = str(record.msg)
+        if record.created - self._passed.get(kind, -_REPEAT_S) < _REPEAT_S:
+            return False
+        self._passed[kind] = record.created
+        return True
 
 
 def _secret_values(settings: Settings) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from workers.database.database import open_database
 from workers.database.notifications import Listener
 from workers.process.exit_status import ExitStatus
 from workers.process.waiting import first_done
-from workers.process.watchdog import run_process
+from workers.process.watchdog import end_if_broken, run_process
 from workers.settings.settings import Settings
 from workers.upkeep.expiry import Expiry
 from workers.webhooks.outbound import Outbound, Policy
@@ -29,7 +29,10 @@ WEBHOOK_CHANNEL = "biresnerf_webhooks"
 async def dispatch(settings: Settings, stop: asyncio.Event) -> None:
     """Work until ``stop``, then finish the current deliveries; raises `SetupError`."""
     url = settings.require_database_url()
-    async with open_database(url, connections=4, silence_s=settings.stall_s) as database:
+    async with (
+        open_database(url, connections=4, silence_s=settings.stall_s) as database,
+        end_if_broken(database.broken),
+    ):
         listener = Listener(database, settings.poll_s, WEBHOOK_CHANNEL)
         listening = asyncio.create_task(listener.run())
         sender = WebhookSender(database, listener, Outbound(Policy.of(settings)), settings)

@@ -23,6 +23,11 @@ class Monitor:
     def __init__(self, database: Database, files: FileStore, stall_s: float) -> None:
         self._database, self._files, self._stall_s = database, files, stall_s
 
+    @property
+    def broken(self) -> asyncio.Event:
+        """Set once this process lost connections to the database for good."""
+        return self._database.broken
+
     async def statistics(self) -> Statistics:
         """The figures; raises `Unavailable`."""
         return await read_statistics(self._database, self._stall_s)
