@@ -37,7 +37,7 @@ from biresnerf.refinement.adjustment.adjustment import Adjustment, adjust_poses
 from biresnerf.refinement.adjustment.evidence import Evidence, PosePrior
 from biresnerf.refinement.adjustment.ideal import straight_tracks
 from biresnerf.refinement.adjustment.lens.corrected_camera import corrected_camera
-from biresnerf.refinement.adjustment.lens.lenses import K1, K2, LENS
+from biresnerf.refinement.adjustment.lens.lenses import CENTRE, K1, K2, LENS
 from biresnerf.refinement.finish.candidates import PRIOR
 from biresnerf.refinement.finish.lens_evidence import lenses_before
 from biresnerf.refinement.finish.lens_model import supported_lenses
@@ -115,7 +115,9 @@ def compare_models(given: Dataset, tracks: Tracks, start: Array, focal: float) -
         assert found.lenses is not None
         _print(name, found, truth)
         for row, camera in enumerate(hidden):
+            centre = np.hypot(*found.lenses.deviation[row, CENTRE])
             print(f"  camera {row}: {corrected_camera(camera, found.lenses.correction[row])}")
+            print(f"  standard deviation of its principal point: {np.degrees(centre):.3f} degrees")
         print(f"  true: {given.cameras}")
 
 
