@@ -15,7 +15,7 @@ SwitchReason = Literal["stable", "cap"]
 IntrinsicsSource = Literal["given", "exif", "predicted", "colmap", "guessed", "refined"]
 PoseSource = Literal[
     "given", "colmap", "matches-incremental", "matches-global", "neighbours", "nearest-view", "forward-facing",
-    "turntable",
+    "turntable", "gimbal",
 ]  # fmt: skip
 CandidateName = Literal["input", "matched", "refined", "adjusted-tracks", "adjusted-patches", "adjusted"]
 VerdictName = Literal["improved", "unchanged", "kept_input", "inconclusive", "failed_check"]
@@ -128,7 +128,7 @@ class ImageReport(FrozenModel):
     name: str = Field(examples=["images/0001.jpg"])
     pose_source: PoseSource = Field(
         description="Who found the pose that the optimisation started from: the user, COLMAP from the images alone or "
-        "beside the given poses, or a guess from other images."
+        "beside the given poses, GPS and a drone's gimbal, or a guess from other images."
     )
     held_out: bool = Field(description="Never used to train the field.")
     fixed: bool = Field(False, description="Kept where it was, on request.")

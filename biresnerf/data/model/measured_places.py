@@ -20,7 +20,7 @@ class PositionPriors:
         origin: latitude, longitude (degrees) and height (m), the median of all; None for a frame of the source's own.
         epsg: EPSG's number of the origin's coordinates, or of the source's frame; None where it is not known.
         rotations: float64 [m, 3, 3], from the cameras' axes to those of the positions, as a drone's gimbal has them;
-            None where some photo does not say.
+            NaN for photos that do not say, and None where none does.
     """
 
     source: str
@@ -30,6 +30,13 @@ class PositionPriors:
     origin: tuple[float, float, float] | None
     epsg: int | None
     rotations: NDArray[np.float64] | None = None
+
+    @property
+    def turned(self) -> NDArray[np.bool_]:
+        """Which of them [m] have a rotation."""
+        if self.rotations is None:
+            return np.zeros(len(self.rows), dtype=np.bool_)
+        return np.asarray(np.isfinite(self.rotations).all((1, 2)))
 
     def of(self, frames: NDArray[np.bool_]) -> PositionPriors:
         """Those of these frames [n] alone, with the same origin."""

@@ -14,6 +14,7 @@ from biresnerf.report import PoseSource, TrialReport
 
 MATCHED_SOURCES: frozenset[PoseSource] = frozenset({"colmap", "matches-incremental", "matches-global"})
 MOSTLY_MATCHED = 0.8  # share of the cameras from which on feature matches placed most
+DOUBTED = GUESSES | {"gimbal"}  # poses that need not agree with those of the other cameras
 GUESSED_MOST = 0.5  # of the cameras: with more guesses there is no field of others to agree with
 
 # Float64 [n, 4, 4]; in JSON a list of lists.
@@ -62,8 +63,8 @@ class InitialPoses:
 
     @property
     def guessed(self) -> NDArray[np.bool_]:
-        """Which poses [n] are guesses from other images; none where most are, as all are equally doubtful then."""
-        guessed = np.array([source in GUESSES for source in self.sources])
+        """Which poses [n] are guesses, or a gimbal's; none where most are, as all are equally doubtful then."""
+        guessed = np.array([source in DOUBTED for source in self.sources])
         return guessed if guessed.mean() <= GUESSED_MOST else np.zeros_like(guessed)
 
     @property

@@ -1,4 +1,4 @@
-"""Poses for images that no feature matches placed: guesses from the images around them, each named for what it is."""
+"""Poses for images that no feature matches placed: measured, or guesses from the images around them."""
 
 from __future__ import annotations
 
@@ -8,11 +8,47 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.model.image_order import natural_order, taken_along_a_path
+from biresnerf.data.model.measured_places import PositionPriors
+from biresnerf.geometry.body_offset import MAXWELL_MEDIAN, tie
+from biresnerf.geometry.earth.georeference import MOST_SCATTER, MOST_TURNED_DEG, not_far_off
+from biresnerf.geometry.focus import rms_spread
 from biresnerf.geometry.rigid import interpolate_pose
 from biresnerf.report import PoseSource
 
 WIDEST_GAP = 6  # images from one known pose to the next that are still taken for a path
 FARTHEST = 3  # images beyond the end of a path that still take its last pose
+LEAST_TIED = 3  # cameras that tell the frame of measured poses
+
+
+def fill_measured(
+    world_from_cam: NDArray[np.float64], known: NDArray[np.bool_], priors: PositionPriors | None
+) -> NDArray[np.bool_]:
+    """Fills poses [n, 4, 4] that are not ``known`` [n] by GPS and a drone's gimbal, in place; says which [n].
+
+    Known cameras tell the frame of these, and how the camera is mounted: an offset that all share (`tie`). Where none
+    is known, poses are in the frame of the positions, and the camera looks where the gimbal says. None is filled where
+    known cameras contradict the measurements, or are fewer than `LEAST_TIED`.
+    """
+    filled = np.zeros(len(known), dtype=np.bool_)
+    if priors is None or priors.rotations is None:
+        return filled
+    told = priors.turned & not_far_off(priors.positions_m)
+    rows, measured = priors.rows[told], np.tile(np.eye(4), (int(told.sum()), 1, 1))
+    measured[:, :3, :3], measured[:, :3, 3] = priors.rotations[told], priors.positions_m[told]
+    tied, new = known[rows], ~known[rows]
+    found = measured
+    if known.any():
+        if not new.any() or tied.sum() < LEAST_TIED:
+            return filled
+        both = tie(world_from_cam[rows[tied]], measured[tied])
+        spread = rms_spread(measured[tied, :3, 3])
+        turned_deg = float(np.degrees(both.rotation * MAXWELL_MEDIAN))
+        if turned_deg > MOST_TURNED_DEG or both.position * MAXWELL_MEDIAN > MOST_SCATTER * spread:
+            return filled
+        mounted = np.eye(4) if both.offset is None else both.offset.body_from_cam
+        found = both.given_from_fitted.inverse().apply_to_poses(measured @ mounted)
+    world_from_cam[rows[new]], filled[rows[new]] = found[new], True
+    return filled
 
 
 def guess_missing(

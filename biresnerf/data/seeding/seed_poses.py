@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.data.formats.positions.position_priors import position_priors
 from biresnerf.data.model.dataset import GUESSES, Cut, Dataset
 from biresnerf.data.photos.image_likeness import likeness
 from biresnerf.data.photos.named_images import MIN_IMAGES
@@ -29,7 +30,7 @@ from biresnerf.data.seeding.match_poses import (
     in_measured_frame,
     without_offset,
 )
-from biresnerf.data.seeding.missing_poses import guess_missing
+from biresnerf.data.seeding.missing_poses import fill_measured, guess_missing
 from biresnerf.data.seeding.on_turntable import even_ring
 from biresnerf.data.seeding.seeding_progress import OnSeeding
 from biresnerf.errors import FAULTS_RAISE, InputError, RefinementError
@@ -48,6 +49,10 @@ STILL = (
 # Median likeness of all pairs of photos: from nearly one place 0.56 (LLFF's horns) to 0.87, around a scene 0.1 to 0.66.
 FACING_ALIKE = 0.4
 MATCHED: dict[str, PoseSource] = {"incremental": "matches-incremental", "global": "matches-global"}
+BY_GIMBAL = (
+    "the cameras begin where GPS and the angles of the drone's gimbal say that they are. How far these are off is not "
+    "known, nor how the camera is mounted."
+)
 OVERLAP_HINT = (
     "Take sharp photos that overlap by more than half, of something with texture, from many places; "
     "or give approximate poses."
@@ -83,14 +88,19 @@ class _Given:
     def candidate(
         self, name: PoseSource, matched: MatchedPoses | None, source: PoseSource, matches: NDArray[np.int64]
     ) -> InitialPoses:
-        """``matched`` where it placed an image, else the given pose, else a guess."""
+        """``matched`` where it placed an image, else the given pose, else by GPS and a gimbal, else a guess."""
         poses = self.poses.copy() if matched is None else matched.world_from_cam.copy()
         placed = np.zeros(len(poses), dtype=np.bool_) if matched is None else matched.placed
+        measured = self.measured(poses, placed | self.posed)
         # Photos near each other may have been taken with the camera held level and on its side.
         shown = shown_from_cam(self.dataset.frames)
         upright = poses @ shown.swapaxes(1, 2)
         guessed = guess_missing(
-            upright, placed | self.posed, self.dataset.names, matches, cache(lambda: likeness(self.dataset))
+            upright,
+            placed | self.posed | measured,
+            self.dataset.names,
+            matches,
+            cache(lambda: likeness(self.dataset)),
         )
         sources: list[PoseSource] = ["given"] * len(poses)
         for i, guess in enumerate(guessed):
@@ -98,7 +108,15 @@ class _Given:
                 poses[i] = upright[i] @ shown[i]
             if guess is not None or placed[i]:
                 sources[i] = guess or source
+            elif measured[i]:
+                sources[i] = "gimbal"
         return InitialPoses(poses, name, tuple(sources))
+
+    def measured(self, poses: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Which poses [n, 4, 4] GPS and a gimbal tell beside those ``known`` [n]; they are filled in."""
+        if known.all():
+            return np.zeros_like(known)
+        return fill_measured(poses, known, position_priors(self.dataset))
 
     def without_matches(self) -> InitialPoses:
         """The given poses, and guesses for the missing ones."""
@@ -121,9 +139,10 @@ def seed_poses(
 
     ``given`` takes the poses as they are. ``none`` looks for no features: missing poses are guessed from other
     images. ``auto`` lets features complete the given poses and compete with them; where there are none, COLMAP maps
-    the images from scratch, in a frame and scale of its own. ``colmap`` does that in any case and then ties the result
-    to the frame of given poses. Images that COLMAP cannot place are guessed from those it can. ``turntable`` looks for
-    no features either and puts all images evenly on a level ring, in the order of their names.
+    the images from scratch, in a frame and scale of its own. ``colmap`` does that in any case and then ties the
+    result to the frame of given poses. Images that COLMAP cannot place are where GPS and a drone's gimbal say, or
+    guessed. ``turntable`` looks for no features either and puts all images evenly on a level ring, in the order of
+    their names.
 
     COLMAP's threads make its answer differ a little from run to run. A run that is to be continued keeps it in the
     file ``remember``, with colmap.log beside it. ``on_progress`` is called only if
@@ -187,9 +206,22 @@ def _refuse_missing(dataset: Dataset) -> None:
 def _without_features(given: _Given) -> InitialPoses:
     if given.posed.any():
         return given.without_matches()
+    if (measured := _by_gimbal(given)) is not None:
+        return measured
     name: PoseSource = "forward-facing"
     count = len(given.dataset)
     return InitialPoses(shown_from_cam(given.dataset.frames), name, (name,) * count)
+
+
+def _by_gimbal(given: _Given) -> InitialPoses | None:
+    """Where GPS and a gimbal say that the cameras are, if they do of enough of them."""
+    if given.measured(given.poses.copy(), given.posed).sum() < _least_placed(given.dataset):
+        return None
+    return given.candidate("gimbal", None, "gimbal", np.zeros((len(given.poses),) * 2, dtype=np.int64))
+
+
+def _least_placed(dataset: Dataset) -> int:
+    return max(MIN_IMAGES, int(np.ceil(LEAST_REGISTERED * len(dataset))))
 
 
 def _without_colmap(given: _Given, start: StartPoses) -> Seeding:
@@ -241,7 +273,7 @@ def _from_scratch(given: _Given, mapping: Mapping, start: StartPoses) -> Seeding
     dataset = given.dataset
     models = [m for m in mapping.models if model_lens_problem(dataset, m) is None]
     placed = max((len(model.rows) for model in models), default=0)
-    least = max(MIN_IMAGES, int(np.ceil(LEAST_REGISTERED * len(dataset))))
+    least = _least_placed(dataset)
     if placed < least:
         what = f"COLMAP could place {placed} of {len(dataset)} images; at least {least} are needed"
         if start == "colmap":
@@ -273,8 +305,11 @@ def _tied(model: MappedModel, given: _Given) -> MatchedPoses:
 
 
 def _facing_forward(given: _Given, what: str) -> Seeding:
-    """All cameras at one place, if the photos are alike enough to have been taken from nearly there."""
+    """Where a gimbal says, else all cameras at one place, if photos are alike enough to have been taken from there."""
     dataset = given.dataset
+    if (measured := _by_gimbal(given)) is not None:
+        notes = (*dataset.warnings, f"{what}: {BY_GIMBAL}", *turning_notes(dataset))
+        return _seeding(replace(dataset, warnings=notes), measured)
     alike = likeness(dataset)
     pairs, turns = alike[np.triu_indices(len(alike), 1)], turning_notes(dataset)
     if float(np.median(pairs)) < FACING_ALIKE:
@@ -306,6 +341,12 @@ def _seeding(dataset: Dataset, *candidates: InitialPoses) -> Seeding:
     )
     guessed = [f"{f.name} ({f.pose_source})" for f in frames if f.pose_source in GUESSES]
     notes = dataset.warnings
+    measured = [f.name for f in frames if f.pose_source == "gimbal"]
+    if measured and first.source != "gimbal":
+        notes += (
+            f"No feature matches placed {len(measured)} of {len(frames)} images; their poses are those of GPS and the "
+            f"drone's gimbal: {few_names(measured, 20)}",
+        )
     if guessed:
         notes += (
             f"No feature matches placed {len(guessed)} of {len(frames)} images; their poses were guessed from "

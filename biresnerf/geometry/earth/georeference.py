@@ -57,8 +57,8 @@ def fit_positions(
         world_from_cam: the cameras.
         positions_m: in metres, in any frame.
         accuracy_m: stated standard deviations of the positions along the axes [m, 3], NaN where they are not known.
-        rotations: of the cameras in the frame of the positions [m, 3, 3], as a gimbal measured them; they tell the turn
-            about a line.
+        rotations: of the cameras in the frame of the positions [m, 3, 3], as a gimbal measured them, NaN where it did
+            not; they tell the turn about a line.
 
     Raises:
         NoGeoreference: too few positions; or all on a line, or scattered as far as they spread, so that a turn is open.
@@ -66,10 +66,9 @@ def fit_positions(
     if len(positions_m) < LEAST_POSITIONS:
         raise NoGeoreference(f"{len(positions_m)} photos have a position, and {LEAST_POSITIONS} are needed")
     # The fit is robust from a start that a few gross errors must not spoil.
-    away = np.linalg.norm(positions_m - np.median(positions_m, axis=0), axis=1)
-    if not away.any():
+    used = not_far_off(positions_m)
+    if not (positions_m != positions_m[0]).any():
         raise NoGeoreference("all positions are at one place")
-    used = away <= FARTHEST * np.median(away)
     there = np.tile(np.eye(4), (len(positions_m), 1, 1))
     there[:, :3, 3] = positions_m
     try:
@@ -77,7 +76,9 @@ def fit_positions(
     except ValueError:
         raise NoGeoreference("the cameras are at one place") from None
     if rotations is not None and _spread(there[used][:, :3, 3])[1] < LINE * _spread(there[used][:, :3, 3])[0]:
-        return _along_a_line(world_from_cam, there, rotations, used, accuracy_m)
+        turned = used & np.isfinite(rotations).all((1, 2))
+        if turned.sum() >= LEAST_POSITIONS:
+            return _along_a_line(world_from_cam, there, rotations, turned, accuracy_m)
     found = metres_from_world.apply_to_poses(world_from_cam)[:, :3, 3]
     apart = np.linalg.norm(found - positions_m, axis=1)
     residual = float(np.median(apart[used]))
@@ -91,6 +92,12 @@ def fit_positions(
         )
     doubt = "" if accuracy_m is None else _doubt(apart[used], accuracy_m[used])
     return Georeference(metres_from_world, used, apart, doubt)
+
+
+def not_far_off(positions_m: Array) -> NDArray[np.bool_]:
+    """Positions [m] that are not so far from the others that they must be wrong."""
+    away = np.linalg.norm(positions_m - np.median(positions_m, axis=0), axis=1)
+    return np.asarray(away <= FARTHEST * np.median(away))
 
 
 def _along_a_line(

@@ -176,6 +176,7 @@ def compare_without_training(scene: Scene, refined: RefinedPoses, lost: int) -> 
         out_of_frame=frame_doubt(turned, shifted, spread) if grounded and not failed else "",
         faults=tuple(map(str, dataset.faults)),
         offset=dataset.body_offset is not None,
+        by_gimbal=sum(frame.pose_source == "gimbal" for frame in dataset.frames) > len(dataset) / 2,
         favoured_by_positions=_favoured_by_positions(dataset, before, after, refined.dataset, placed),
     )
     return Compared(before, after, placed, turned, shifted, findings)

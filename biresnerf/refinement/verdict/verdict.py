@@ -42,6 +42,7 @@ class Findings:
         compared_with: where the input's poses come from.
         grounded: whether the input's poses are given ones or come from matches, and are not mere guesses.
         offset: whether an offset that all given poses shared was taken back.
+        by_gimbal: whether most of the input's poses are those of GPS and a gimbal.
         favoured_by_positions: 1 where measured places fit the refined poses better beyond chance, -1 the input's, 0
             where neither, and their accuracy is stated; else None.
     """
@@ -57,6 +58,7 @@ class Findings:
     working_share: float = 1.0
     offset: bool = False
     favoured_by_positions: Literal[-1, 0, 1] | None = None
+    by_gimbal: bool = False
 
     @property
     def explained(self) -> bool:
@@ -241,6 +243,11 @@ def _sentences(f: Findings) -> list[str]:
     if f.offset:
         sentences.append(
             "The input's poses are those of the cameras: an offset that all shared was taken back."
+        )
+    if f.by_gimbal:
+        sentences.append(
+            "The poses found are those of GPS and the drone's gimbal: how far they are off is not known, as no feature "
+            "matches tell."
         )
     if f.heldout is not None:
         p = f.heldout.psnr

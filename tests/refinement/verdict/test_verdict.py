@@ -164,6 +164,12 @@ def test_found_poses_yield_to_refined_ones_that_heed_measured_places():
         assert decide(replace(heeding, **doubt)).returned == "input"
 
 
+def test_measured_poses_are_called_what_they_are():
+    told = decide(findings(held_out(0.05), compared_with="seeded", by_gimbal=True))
+    assert told.returned == "input"
+    assert any("GPS and the drone's gimbal" in sentence for sentence in told.why)
+
+
 def test_without_evidence_refined_poses_stand_only_against_a_guess():
     assert decide(findings(grounded=False)).returned == "refined"
     assert decide(findings(held_out(-4.0), grounded=False)).returned == "input"

@@ -35,13 +35,25 @@ def position_priors(dataset: Dataset) -> PositionPriors | None:
     if dataset.cut is not None:
         # Of a panorama's views the first alone, so that its position counts once.
         found = position_priors(dataset.cut.whole)
-        return None if found is None else replace(found, rows=dataset.cut.firsts[found.rows])
+        # The angles of a gimbal are none of a panorama that was made of many photos.
+        return found and replace(found, rows=dataset.cut.firsts[found.rows], rotations=None)
     table, _ = _of_table(dataset)
     for one in (table, _of_metashape(dataset)):
         if one is not None and (places := _by_frame(dataset, one)):
+            if one.in_degrees:
+                tags = _tags(dataset)
+                places = {
+                    i: p._replace(angles_deg=tags[i].angles_deg if i in tags else None)
+                    for i, p in places.items()
+                }
             return _priors(one.source, places, one.epsg, in_degrees=one.in_degrees)
-    tags = {i: tag for i, f in enumerate(dataset.frames) if (tag := read_geotag(f.path, f.name)) is not None}
+    tags = _tags(dataset)
     return _priors("EXIF", tags, WGS84, in_degrees=True) if tags else None
+
+
+def _tags(dataset: Dataset) -> dict[int, MeasuredPlace]:
+    """What photos say themselves, by frame."""
+    return {i: tag for i, f in enumerate(dataset.frames) if (tag := read_geotag(f.path, f.name)) is not None}
 
 
 def position_notes(dataset: Dataset) -> tuple[str, ...]:
@@ -108,8 +120,8 @@ def _priors(
         return PositionPriors(source, rows, places, accuracy, None, epsg)
     origin = np.median(places, axis=0)
     latitude, longitude, height = origin.tolist()
-    angles = [place.angles_deg for place in found.values() if place.angles_deg is not None]
-    rotations = held_so(np.array(angles)) if len(angles) == len(places) else None
+    angles = np.array([place.angles_deg or (np.nan,) * 3 for place in found.values()])
+    rotations = held_so(angles) if np.isfinite(angles).any() else None
     return PositionPriors(
         source, rows, east_north_up(places, origin), accuracy, (latitude, longitude, height), epsg, rotations
     )
