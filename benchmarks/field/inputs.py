@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +23,11 @@ EARTH_M = 6_371_000.0
 
 def photos_alone(source: Path, names: tuple[str, ...], folder: Path) -> Path:
     """A folder with links to the photos, byte for byte as published."""
+    photos = folder / "images"
+    shutil.rmtree(photos, ignore_errors=True)  # of an earlier run with more of them
+    photos.mkdir(parents=True)
     for name in names:
-        to = folder / "images" / Path(name).name
-        to.parent.mkdir(parents=True, exist_ok=True)
-        if not to.exists():
-            os.link(source / name, to)
+        os.link(source / name, photos / Path(name).name)
     return folder
 
 
