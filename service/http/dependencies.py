@@ -20,13 +20,10 @@ from service.http.metrics import WebMetrics
 from service.http.problems import ProblemError
 from workers.engine import Stores
 from workers.process.disk_space import DiskBudget, upload_disk_budget
+from workers.process.memory_limits import MemoryShares, memory_limit, memory_shares
 from workers.process.turns import Turns
 from workers.settings.settings import Settings
 
-# Archives that one process unpacks at a time; each takes a core and memory.
-UNPACKED_AT_ONCE = 4
-# Photos that one process decodes at a time, likewise.
-DECODED_AT_ONCE = 2
 Listing = TypeVar("Listing", bound=BaseModel)
 _ID = re.compile(r"^[a-z]{2,3}_[0-9A-Za-z]{1,40}$", re.ASCII)
 
@@ -73,11 +70,14 @@ class Service:
     started: asyncio.Event = field(default_factory=asyncio.Event)
     closing: asyncio.Event = field(default_factory=asyncio.Event)
     background: set[asyncio.Task[Any]] = field(default_factory=set)
-    unpacking: Turns = field(default_factory=lambda: Turns(UNPACKED_AT_ONCE))
-    decoding: Turns = field(default_factory=lambda: Turns(DECODED_AT_ONCE))
+    memory: MemoryShares = field(init=False)
+    unpacking: Turns = field(init=False)
+    decoding: Turns = field(init=False)
     sending: UploadLimit = field(init=False)
 
     def __post_init__(self) -> None:
+        self.memory = memory_shares(memory_limit(), self.settings.processes)
+        self.unpacking, self.decoding = Turns(self.memory.unpacks), Turns(self.memory.pictures)
         self.sending = UploadLimit(self.settings.key_uploads)
 
     @property

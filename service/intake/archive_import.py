@@ -27,8 +27,6 @@ logger = logging.getLogger(__name__)
 RATIO_MAX = 200.0
 _CHUNK = 2**20
 _POLL_S = 0.3  # between two looks at an upload that another process stores
-# Python, zlib, and the table of contents of an archive with the largest number of entries.
-_UNPACK_MEMORY_BYTES = 1536 * 2**20
 # A folder of this name is part of the dataset, even if it is the only one in the archive.
 _KEPT_FOLDERS = {"images"}
 
@@ -64,7 +62,7 @@ async def import_archive(
     )
     limits = Limits(
         seconds=settings.check_timeout_s,
-        memory_bytes=_UNPACK_MEMORY_BYTES,
+        memory_bytes=service.memory.unpack,
         file_bytes=settings.max_file_bytes + 2**20,
     )
     try:

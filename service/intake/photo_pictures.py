@@ -24,8 +24,7 @@ PictureName = Literal["picture.jpg", "mask.png"]
 LONG_SIDE_PX = 1280
 _FILES = "files"
 _QUALITY = 92  # of JPEG, with colours as fine as brightness: areas are chosen by them
-# One decoder with a picture of up to 150 million pixels.
-_LIMITS = Limits(seconds=60, memory_bytes=6 * 2**30, file_bytes=16 * 2**20)
+_SECONDS, _FILE_BYTES = 60.0, 16 * 2**20
 
 
 class DrawRequest(FrozenModel):
@@ -60,7 +59,9 @@ class Picture:
             sources = [(file.key, file.path) for file in self.files]
             await service.stores.files.stage(sources, folder / _FILES)
             request = DrawRequest(folder=folder, photo=self.photo, camera=self.camera, name=self.name)
-            await run_confined("service.intake.photo_pictures", request, _LIMITS)
+            memory = service.memory.picture
+            limits = Limits(seconds=_SECONDS, memory_bytes=memory, file_bytes=_FILE_BYTES)
+            await run_confined("service.intake.photo_pictures", request, limits)
             return (folder / self.name).read_bytes()
 
 

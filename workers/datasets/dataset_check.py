@@ -21,6 +21,7 @@ from biresnerf.wire.datasets import CheckReport
 from biresnerf.wire.problems import JobError
 from workers.database.database import Connection, Database
 from workers.process.disk_space import EXIT_DISK
+from workers.process.memory_limits import CHECK_VARIABLE, memory_limit, memory_shares
 from workers.process.turns import Turns
 from workers.process.waiting import retry_while_unavailable
 from workers.records import shown_folder, shown_key
@@ -39,6 +40,13 @@ CHECKS = "checks"
 IN_USE = "in-use"
 SETTLED_S = 1.0
 LOOK_S = 0.5  # between two looks at a check that another process makes
+GIVE_BACK_S = 2.0
+LOSSES_MAX = 2
+FATAL = JobError(
+    code="check_crashed",
+    detail=f"{LOSSES_MAX} processes were lost while they checked the files.",
+    hint="Look for damaged or very large files.",
+)
 
 
 class Checker:
@@ -61,7 +69,12 @@ class Checker:
             return
         while True:
             async with self._turns.turn(owned[0]["tenant"]):
-                if await retry_while_unavailable(lambda: self._take(dataset_id, token)):
+                losses = await retry_while_unavailable(lambda: self._take(dataset_id, token))
+                if losses is not None and losses >= LOSSES_MAX:
+                    await retry_while_unavailable(
+                        lambda: self._database.run(_record, dataset_id, token, FATAL)
+                    )
+                elif losses is not None:
                     await self._check(dataset_id, token)
             rows = await retry_while_unavailable(
                 lambda: self._database.fetch("SELECT state FROM datasets WHERE id = %s", dataset_id)
@@ -79,15 +92,20 @@ class Checker:
         )
         return tuple(row["id"] for row in rows)
 
-    async def _take(self, dataset_id: str, token: uuid.UUID) -> bool:
-        """Take or renew the lease. A lease, not a lock: who is frozen or cut off loses it."""
+    async def _take(self, dataset_id: str, token: uuid.UUID) -> int | None:
+        """Take or renew the lease; tells how many were lost who had it before, or none where it is another's.
+
+        A lease, not a lock: who is frozen or cut off loses it.
+        """
         rows = await self._database.fetch(
-            "UPDATE datasets SET check_token = %s, check_until = clock_timestamp() + make_interval(secs => %s)"
+            "UPDATE datasets SET check_token = %s, check_until = clock_timestamp() + make_interval(secs => %s),"
+            " check_losses = check_losses + (check_token IS NOT NULL AND check_token <> %s)::int"
             " WHERE id = %s AND state = 'finalizing'"
-            " AND (check_token = %s OR check_until IS NULL OR check_until < clock_timestamp()) RETURNING id",
-            *(token, 2 * self._settings.beat_s, dataset_id, token),
+            " AND (check_token = %s OR check_until IS NULL OR check_until < clock_timestamp())"
+            " RETURNING check_losses",
+            *(token, 2 * self._settings.beat_s, token, dataset_id, token),
         )
-        return bool(rows)
+        return int(rows[0]["check_losses"]) if rows else None
 
     async def _check(self, dataset_id: str, token: uuid.UUID) -> None:
         rows = await retry_while_unavailable(
@@ -104,6 +122,9 @@ class Checker:
             )
             files = [(row["key"], row["path"]) for row in rows]
             outcome = await check_files(self._files, files, self._settings, shown)
+        except BaseException:  # a full disk, a shutdown: it was not the files that ended it
+            await self._give_back(dataset_id, token)
+            raise
         finally:
             renewing.cancel()
         await retry_while_unavailable(lambda: self._database.run(_record, dataset_id, token, outcome))
@@ -112,7 +133,23 @@ class Checker:
         while True:
             await asyncio.sleep(self._settings.beat_s / 2)
             with contextlib.suppress(Unavailable):  # the next time will do
-                await self._take(dataset_id, token)
+                if await self._take(dataset_id, token) is None:
+                    # Taken for lost, but only frozen or cut off. (No row where the dataset is gone.)
+                    await self._database.fetch(
+                        "UPDATE datasets SET check_losses = greatest(check_losses - 1, 0)"
+                        " WHERE id = %s AND state = 'finalizing'",
+                        dataset_id,
+                    )
+                    return
+
+    async def _give_back(self, dataset_id: str, token: uuid.UUID) -> None:
+        with contextlib.suppress(Unavailable, TimeoutError):
+            async with asyncio.timeout(GIVE_BACK_S):
+                await self._database.fetch(
+                    "UPDATE datasets SET check_token = NULL, check_until = NULL"
+                    " WHERE id = %s AND check_token = %s",
+                    *(dataset_id, token),
+                )
 
 
 async def _record(
@@ -180,7 +217,9 @@ def _sweep(parent: Path) -> None:
 
 async def _run(dataset: Path, errors: Path, settings: Settings) -> tuple[CheckReport | JobError, bool]:
     """The outcome, and whether a signal ended the program. Raises `OSError` where it found no room to write."""
-    child = await Child.start(settings.check_command, dataset, errors, {"OMP_NUM_THREADS": "1"}, CHECK_NICE)
+    memory = memory_shares(memory_limit(), settings.processes).check
+    variables = {"OMP_NUM_THREADS": "1", CHECK_VARIABLE: str(memory)}
+    child = await Child.start(settings.check_command, dataset, errors, variables, CHECK_NICE)
     try:
         async with asyncio.timeout(settings.check_timeout_s):
             output = b"".join([line async for line in child.lines()])

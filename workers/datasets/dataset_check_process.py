@@ -17,11 +17,10 @@ from typing import Any
 
 from biresnerf.errors import InputError
 from workers.process.disk_space import EXIT_DISK, failed_for_room
+from workers.process.memory_limits import CHECK_BYTES, CHECK_VARIABLE
 from workers.records import shown_folder
 
 EXIT_INPUT_ERROR = 2
-# Address space: numpy and Pillow, and four decoders with pictures of up to 150 million pixels.
-MEMORY_BYTES = 6 * 2**30
 CPU_S = 3600
 FILE_BYTES = 64 * 2**20
 
@@ -33,6 +32,11 @@ def main(folder: Path) -> int:
     try:
         answer: dict[str, Any] = {"report": check(folder, shown_folder(folder))}
         status = 0
+    except MemoryError:
+        detail = f"The check needs more than the {_memory_bytes() // 2**20} MiB that it may take."
+        hint = "Send smaller photos. The operator can give the service more memory."
+        answer = {"error": {"code": "check_crashed", "detail": detail, "hint": hint}}
+        status = EXIT_INPUT_ERROR
     except Exception as error:
         if failed_for_room(error, folder):
             return EXIT_DISK
@@ -85,7 +89,7 @@ def check(folder: Path, shown: Path) -> dict[str, Any]:
 def confine() -> None:
     """Take no more than a check needs, whatever the files say."""
     for kind, amount in (
-        (resource.RLIMIT_AS, MEMORY_BYTES),
+        (resource.RLIMIT_AS, _memory_bytes()),
         (resource.RLIMIT_CPU, CPU_S),
         (resource.RLIMIT_CORE, 0),
         (resource.RLIMIT_FSIZE, FILE_BYTES),
@@ -94,6 +98,10 @@ def confine() -> None:
         _, most = resource.getrlimit(kind)
         wanted = amount if most == resource.RLIM_INFINITY else min(amount, most)
         resource.setrlimit(kind, (wanted, wanted))
+
+
+def _memory_bytes() -> int:
+    return int(os.environ.get(CHECK_VARIABLE, CHECK_BYTES))
 
 
 if __name__ == "__main__":

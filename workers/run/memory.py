@@ -9,6 +9,7 @@ from typing import Any
 
 from biresnerf.options.refine_options import OPTIONS, ResolvedOptions
 from biresnerf.wire.problems import JobError
+from workers.process.memory_limits import GROUPS, PROC, group_files
 
 
 def smaller_options(options: ResolvedOptions) -> dict[str, Any]:
@@ -37,8 +38,9 @@ class OomKills:
     The container's own count where there is one (control groups of version 2 or 1), else the machine's.
     """
 
-    def __init__(self, proc: Path = Path("/proc"), groups: Path = Path("/sys/fs/cgroup")) -> None:
-        self._files = [*_group_files(proc, groups), proc / "vmstat"]
+    def __init__(self, proc: Path = PROC, groups: Path = GROUPS) -> None:
+        counts = group_files("memory.events", "memory.oom_control", proc, groups)
+        self._files = [*counts, proc / "vmstat"]
 
     def count(self) -> int | None:
         """How many so far; none where the kernel does not say."""
@@ -50,20 +52,3 @@ class OomKills:
             if found is not None:
                 return int(found[1])
         return None
-
-
-def _group_files(proc: Path, groups: Path) -> list[Path]:
-    """Where this process's memory control group counts; inside a container its own group is the root."""
-    found = []
-    try:
-        lines = (proc / "self" / "cgroup").read_text().splitlines()
-    except OSError:
-        return []
-    for line in lines:
-        number, controllers, path = line.split(":", 2)
-        if number == "0" and not controllers:
-            found += [groups / path.lstrip("/") / "memory.events", groups / "memory.events"]
-        elif "memory" in controllers.split(","):
-            memory = groups / "memory"
-            found += [memory / path.lstrip("/") / "memory.oom_control", memory / "memory.oom_control"]
-    return found

@@ -47,6 +47,13 @@ def decode(frame: Frame, camera: Camera) -> NDArray[np.uint8]:
             image.load()
             stored = as_stored(_eight_bit(image, frame), image, header.orientation)
             return straightened(turned(stored, frame.orientation), camera.shear)
+        except MemoryError:
+            raise InputError(
+                "image_too_large",
+                f"has {header.width} x {header.height} px, for which there is not enough memory.",
+                where=frame.name,
+                hint="Use a smaller copy of it.",
+            ) from None
         except DAMAGED:
             raise InputError(
                 "image_truncated",

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from service.http.dependencies import UNPACKED_AT_ONCE, Service
+from service.http.dependencies import Service
 from tests.service.conftest import problem, zip_of
 from tests.service.in_process import serving
 from tests.workers.conftest import anyio_backend, database_url, quick_settings, server
@@ -80,7 +80,7 @@ async def test_an_archive_that_waits_for_its_turn_stays_its_takers(database_url:
         begun = await http.post(f"/v1/datasets/{dataset}/uploads", headers=tus)
         address = begun.headers["location"]
         async with AsyncExitStack() as busy:
-            for _ in range(UNPACKED_AT_ONCE):
+            for _ in range(service.memory.unpacks):
                 await busy.enter_async_context(service.unpacking.turn("other"))
             more = {**tus, "Content-Type": "application/offset+octet-stream"}
             assert (await http.patch(address, headers=more, content=archive)).status_code == 204

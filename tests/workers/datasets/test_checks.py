@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import sys
+import uuid
 from pathlib import Path
 
 import pytest
 
 from biresnerf.wire.datasets import DatasetView
-from tests.workers.conftest import ACCEPTED, SHORT_STALL, quick_settings
+from tests.workers.conftest import ACCEPTED, SHORT_STALL, environment, quick_settings
 from tests.workers.datasets.test_datasets import chunks
 from workers.engine import Stores, open_stores
 from workers.process.disk_space import EXIT_DISK
@@ -175,3 +176,74 @@ async def test_a_check_that_a_dead_process_began_is_taken_over(stores: Stores):
     )
     assert await stores.datasets.unfinished() == (), "its owner may live yet"
     assert (await stores.datasets.check(dataset)).state == "ready"
+
+
+async def test_a_dataset_whose_check_takes_its_process_down_twice_is_rejected(stores: Stores):
+    dataset = await finalized_dataset(stores)
+    begun_by_one_that_died = (
+        "UPDATE datasets SET check_token = gen_random_uuid(), check_until = now() - interval '1 s'"
+    )
+    checker = stores.datasets._checker
+    database = stores.jobs._database
+    await database.fetch(begun_by_one_that_died)
+    assert await checker._take(dataset, uuid.uuid4()) == 1, "the second try is made"
+    await database.fetch(begun_by_one_that_died)
+    checked = await stores.datasets.check(dataset)
+    assert checked.error is not None
+    assert (checked.state, checked.error.code) == ("rejected", "check_crashed")
+    assert "2 processes were lost" in checked.error.detail
+
+
+async def test_web_processes_that_a_check_kills_are_at_most_two(database_url: str, tmp_path: Path):
+    marks = tmp_path / "marks"
+    kills_its_parent = (
+        f"import os, signal; open({str(marks)!r}, 'a').write('x'); os.kill(os.getppid(), signal.SIGKILL)"
+    )
+    settings = checked_by(kills_its_parent, database_url, tmp_path)
+    async with open_stores(settings) as stores:
+        dataset = await finalized_dataset(stores)
+        while (await stores.datasets.get(dataset)).state == "finalizing":
+            checking = f"""
+import asyncio
+from workers.engine import open_stores
+from workers.settings.settings import Settings
+async def check():
+    async with open_stores(Settings()) as stores:
+        await stores.datasets.check({dataset!r})
+asyncio.run(check())
+"""
+            process = await asyncio.create_subprocess_exec(
+                sys.executable, "-c", checking, env=environment(settings)
+            )
+            await process.wait()
+        error = (await stores.datasets.get(dataset)).error
+    assert error is not None
+    assert error.code == "check_crashed"
+    assert marks.read_text() == "xx"
+
+
+@pytest.mark.parametrize("how", ["a full disk", "a shutdown", "a frozen process"])
+async def test_what_ends_a_check_and_is_not_the_files_fault_is_no_loss(
+    database_url: str, tmp_path: Path, how: str
+):
+    program = f"import sys; sys.exit({EXIT_DISK})" if how == "a full disk" else "import time; time.sleep(60)"
+    settings = checked_by(program, database_url, tmp_path)
+    async with open_stores(settings) as stores:
+        dataset, database = await finalized_dataset(stores), stores.jobs._database
+        running = asyncio.create_task(stores.datasets.check(dataset))
+        if how == "a full disk":
+            with pytest.raises(OSError, match="no room"):
+                await running
+        while not running.done() and not list((settings.scratch_dir / "checks").glob("*/log.txt")):
+            await asyncio.sleep(0.02)
+        if how == "a frozen process":  # another took the dataset, for it seemed to be dead; now it goes on
+            await database.fetch(
+                "UPDATE datasets SET check_token = gen_random_uuid(), check_losses = check_losses + 1,"
+                " check_until = now() + interval '1 h'"
+            )
+            while (await database.fetch("SELECT check_losses FROM datasets"))[0]["check_losses"]:
+                await asyncio.sleep(0.05)
+            await database.fetch("UPDATE datasets SET check_token = NULL, check_until = NULL")
+        running.cancel()
+        await asyncio.wait([running])
+        assert await stores.datasets._checker._take(dataset, uuid.uuid4()) == 0

@@ -1,0 +1,88 @@
+"""How much memory programs that read strangers' files may take, so that side by side they stay below the container's.
+
+A container that runs out of memory is killed as a whole, with every request that it serves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+PROC, GROUPS = Path("/proc"), Path("/sys/fs/cgroup")
+# A web process itself, after load.
+WEB_BYTES = 512 * 2**20
+# Without a limit. The check: numpy, Pillow, and decoders with pictures of up to 150 million pixels; a picture for
+# pages: one such decoder; unpacking: zlib, and the table of contents of the archive with most entries.
+CHECK_BYTES, PICTURE_BYTES, UNPACK_BYTES = 6 * 2**30, 6 * 2**30, 1536 * 2**20
+CHECK_VARIABLE = "BIRESNERF_CHECK_MEMORY_BYTES"  # tells the check's program its limit
+PICTURES_AT_ONCE, UNPACKED_AT_ONCE = 2, 4
+# Rather one after the other than each with less; a picture of 150 million pixels takes the first.
+PICTURE_BYTES_MIN, UNPACK_BYTES_MIN = 2816 * 2**20, 128 * 2**20
+# With less than this for all of them, the programs do not even start.
+SHARED_BYTES_MIN = 2**30
+
+
+@dataclass(frozen=True)
+class MemoryShares:
+    """Bytes for each program of a kind, and how many of that kind run at a time; there is one check."""
+
+    check: int
+    picture: int
+    pictures: int
+    unpack: int
+    unpacks: int
+
+
+def memory_shares(limit: int | None, processes: int) -> MemoryShares:
+    """What the programs of each of ``processes`` web processes may take in a container limited to ``limit`` bytes.
+
+    Half is for the check, three eighths are for pictures. Below 1.5 GiB for each web process the limit cannot be kept.
+    """
+    if limit is None:
+        return MemoryShares(CHECK_BYTES, PICTURE_BYTES, PICTURES_AT_ONCE, UNPACK_BYTES, UNPACKED_AT_ONCE)
+    shared = max(limit // processes - WEB_BYTES, SHARED_BYTES_MIN)
+    for_pictures, for_archives = 3 * shared // 8, shared // 8
+    pictures = max(1, min(PICTURES_AT_ONCE, for_pictures // PICTURE_BYTES_MIN))
+    unpacks = max(1, min(UNPACKED_AT_ONCE, for_archives // UNPACK_BYTES_MIN))
+    return MemoryShares(
+        check=min(CHECK_BYTES, shared // 2),
+        picture=min(PICTURE_BYTES, for_pictures // pictures),
+        pictures=pictures,
+        unpack=min(UNPACK_BYTES, for_archives // unpacks),
+        unpacks=unpacks,
+    )
+
+
+def memory_limit(proc: Path = PROC, groups: Path = GROUPS) -> int | None:
+    """The least limit of this process's control groups (version 2 or 1), bytes; none where nothing limits it."""
+    found = []
+    for path in group_files("memory.max", "memory.limit_in_bytes", proc, groups):
+        try:
+            found.append(int(path.read_text()))
+        except (OSError, ValueError):  # no such file, or "max"
+            continue
+    # Version 1 says "no limit" by a number near the largest.
+    return min((limit for limit in found if limit < 2**60), default=None)
+
+
+def group_files(name: str, name_in_v1: str, proc: Path = PROC, groups: Path = GROUPS) -> list[Path]:
+    """Where this process's memory control groups may have the file, the innermost first.
+
+    Inside a container its own group is the root.
+    """
+    try:
+        lines = (proc / "self" / "cgroup").read_text().splitlines()
+    except OSError:
+        return []
+    found = []
+    for line in lines:
+        number, controllers, path = line.split(":", 2)
+        if number == "0" and not controllers:
+            root, file = groups, name
+        elif "memory" in controllers.split(","):
+            root, file = groups / "memory", name_in_v1
+        else:
+            continue
+        group = root / path.lstrip("/")
+        found += [folder / file for folder in (group, *group.parents) if folder.is_relative_to(root)]
+    return found
