@@ -1,8 +1,8 @@
 """Whether results keep their word: ``python -m benchmarks.method.honesty SET...``.
 
-Each SET holds true poses. It is refined from ten kinds of input (`STARTS`). Two things must never happen: the verdict
-``improved`` where the true error of the placed cameras rose, and a camera beyond 5 degrees that the report does not
-name. Prints a JSON line for each run, and the counts at the end.
+Each SET holds true poses. It is refined from eleven kinds of input (`STARTS`). Two things must never happen: the
+verdict ``improved`` where the true error of the placed cameras rose, and a camera beyond 5 degrees that the report does
+not name. Prints a JSON line for each run, and the counts at the end.
 
 Photos are at most 400 px for feature matching and 100 px for the field, every few views of large sets, so that a run
 takes about a minute of one core. With ``--set start=given`` there are no matches, and photos judge alone.
@@ -25,11 +25,13 @@ from numpy.typing import NDArray
 from benchmarks.method.seeding import shrunk, with_focal
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.formats.simple.poses_json import POSES, matrix_of, read_poses_json
-from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.model.dataset import GUESSES, Dataset
 from biresnerf.data.model.refined_set import REFINED
+from biresnerf.data.photos.guessed_lens import GUESSED_FOCAL
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.data.seeding.seed_poses import seed_poses
 from biresnerf.errors import FaultError, InputError
+from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.perturb import orbit_away, perturb_poses
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_robust
@@ -42,7 +44,7 @@ Array = NDArray[np.float64]
 
 STARTS = (
     "true", "matches", "noise 0.005", "noise 0.05", "noise 0.15", "noise 0.35", "tenth lost", "foreign photos",
-    "wrong lens", "wrong matches",
+    "wrong lens", "wrong matches", "photos alone",
 )  # fmt: skip
 VIEWS = 30
 MATCHED_PX, FIELD_PX = 400, 100
@@ -63,6 +65,8 @@ def given_set(truth: Dataset, start: str, seed: int, others: Dataset) -> Dataset
     poses = truth.world_from_cam
     if start == "true":
         return truth
+    if start == "photos alone":
+        return without_lenses(without_poses(truth))
     if start == "matches":
         found = seed_poses(without_poses(truth), seed=seed)
         matched = [c for c in found.candidates if c.matched.any()]
@@ -87,6 +91,16 @@ def given_set(truth: Dataset, start: str, seed: int, others: Dataset) -> Dataset
 def without_poses(truth: Dataset) -> Dataset:
     frames = (replace(frame, world_from_cam=None, pose_source=None) for frame in truth.frames)
     return replace(truth, frames=tuple(frames))
+
+
+def without_lenses(truth: Dataset) -> Dataset:
+    """The set with a guess for each lens, as of photos without EXIF."""
+    guesses = []
+    for camera in truth.cameras:
+        width, height = camera.width, camera.height
+        focal = GUESSED_FOCAL * max(width, height)
+        guesses.append(Camera("SIMPLE_RADIAL", width, height, (focal, width / 2, height / 2, 0.0)))
+    return replace(truth, cameras=tuple(guesses), intrinsics_sources=("guessed",) * len(guesses))
 
 
 def with_foreign_photos(dataset: Dataset, others: Dataset) -> Dataset:
@@ -136,15 +150,11 @@ def errors_deg(poses: Array, truth: Array, placed: NDArray[np.bool_]) -> Array:
     return camera_errors(carried, truth).rotation_deg
 
 
-def judged(
-    given: Dataset, truth: Dataset, report: Report, result: Array, refined: Array
-) -> dict[str, object]:
-    """What was true and what was said of one run that returned some poses, refined ones or the given ones."""
+def judged(truth: Dataset, report: Report, before: Array, result: Array, refined: Array) -> dict[str, object]:
+    """What was true and what was said of one run that returned some poses, refined ones or those before."""
     poses, count = truth.world_from_cam, len(truth)
-    placed = given.posed[:count]
-    given_poses = np.stack([f.world_from_cam for f in given.frames[:count] if f.world_from_cam is not None])
-    before = errors_deg(given_poses, poses, placed)
-    after, found = (errors_deg(each[:count], poses, placed) for each in (result, refined))
+    placed = np.array([image.pose_source not in GUESSES for image in report.images[:count]])
+    before, after, found = (errors_deg(each[:count], poses, placed) for each in (before, result, refined))
     old, new = float(before[placed].mean()), float(after[placed].mean())
     said = report.verdict
     assert said is not None
@@ -186,15 +196,21 @@ def run(
     ):
         output = Path(folder) / "out"
         report = refine_poses(given, output, asked)
-        result = poses_in(output, report)
-        refined = poses_in(output / REFINED, report) if (output / REFINED).exists() else result
-    return judged(given, truth, report, result, refined)
+        before, result = poses_in(output, report)
+        refined = poses_in(output / REFINED, report)[1] if (output / REFINED).exists() else result
+    return judged(truth, report, before, result, refined)
 
 
-def poses_in(folder: Path, report: Report) -> Array:
-    """[n, 4, 4], in the order of the report's images."""
-    found = {image.name: matrix_of(image.world_from_cam) for image in read_poses_json(folder / POSES).images}
-    return np.stack([found[image.name] for image in report.images])
+def poses_in(folder: Path, report: Report) -> tuple[Array, Array]:
+    """Before and after, each [n, 4, 4], in the order of the report's images; after, where there was none before."""
+    found = {image.name: image for image in read_poses_json(folder / POSES).images}
+    images = [found[image.name] for image in report.images]
+    after = [matrix_of(image.world_from_cam) for image in images]
+    before = [
+        pose if image.world_from_cam_before is None else matrix_of(image.world_from_cam_before)
+        for image, pose in zip(images, after, strict=True)
+    ]
+    return np.stack(before), np.stack(after)
 
 
 def main() -> None:
