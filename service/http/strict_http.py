@@ -21,37 +21,57 @@ logger = logging.getLogger(__name__)
 HEADERS_TIMEOUT_S = 20.0
 # A client that reads nothing for so long is disconnected: it holds memory and a file open.
 READER_TIMEOUT_S = 120.0
+HEADERS_MAX = 100
 _TOO_LARGE = 431
 
 
 class _StrictHeads(h11.Connection):
-    """Refuses request heads that another program on the way may read differently, though RFC 9112 lets us take them.
+    """Refuses request heads that `_Head` refuses, which reads each line once, however it arrives."""
 
-    These are lines that end without a carriage return (section 2.2), headers that go on in the next line (5.2), and a
-    length that is given twice, even if equal (6.3).
-    """
+    _head: _Head | None = None
 
     def next_event(self) -> Any:
         """As the base class's. Raises `h11.RemoteProtocolError`."""
         if self.their_state is h11.IDLE:
-            _refuse_ambiguous(self.trailing_data[0])
-        return super().next_event()
+            self._head = self._head or _Head()
+            self._head.read(self.trailing_data[0])
+        event = super().next_event()
+        if self.their_state is not h11.IDLE:
+            self._head = None  # the next bytes are of another request
+        return event
 
 
-def _refuse_ambiguous(received: bytes) -> None:
-    lengths, at = 0, 0
-    while (end := received.find(b"\n", at)) >= 0:
-        line, at = received[at:end], end + 1
-        if not line.endswith(b"\r"):
-            raise h11.RemoteProtocolError("a line of the head does not end with CR LF")
-        if line == b"\r":
-            return
-        if line[:1] in (b" ", b"\t"):
-            raise h11.RemoteProtocolError("a header goes on in the next line")
-        if line.lower().startswith(b"content-length:"):
-            lengths += 1 + line.count(b",")
-        if lengths > 1:
-            raise h11.RemoteProtocolError("Content-Length is given twice")
+class _Head:
+    """The lines of a request's head, as they arrive.
+
+    Refused is what another program on the way may read differently, though RFC 9112 lets us take it: lines that end
+    without a carriage return (section 2.2), headers that go on in the next line (5.2), and a length that is given
+    twice, even if equal (6.3); and more headers than anybody needs.
+    """
+
+    def __init__(self) -> None:
+        self.lines = 0
+        self._lengths = self._line_at = self._searched = 0
+
+    def read(self, received: bytes) -> None:
+        """Read on in all that was received so far. Raises `h11.RemoteProtocolError`."""
+        while (end := received.find(b"\n", self._searched)) >= 0:
+            line = received[self._line_at : end]
+            self._line_at = self._searched = end + 1
+            self.lines += 1
+            if not line.endswith(b"\r"):
+                raise h11.RemoteProtocolError("a line of the head does not end with CR LF")
+            if line == b"\r":
+                return
+            if line[:1] in (b" ", b"\t"):
+                raise h11.RemoteProtocolError("a header goes on in the next line")
+            if self.lines > 1 + HEADERS_MAX:
+                raise h11.RemoteProtocolError(f"there are more than {HEADERS_MAX} headers", _TOO_LARGE)
+            if line.lower().startswith(b"content-length:"):
+                self._lengths += 1 + line.count(b",")
+            if self._lengths > 1:
+                raise h11.RemoteProtocolError("Content-Length is given twice")
+        self._searched = len(received)
 
 
 class StrictHttp(H11Protocol):
@@ -99,7 +119,9 @@ class StrictHttp(H11Protocol):
         """Called by the base class while it handles the parser's error."""
         error = sys.exception()
         if isinstance(error, h11.RemoteProtocolError) and error.error_status_hint == _TOO_LARGE:
-            detail = f"The head of the request is larger than {HEAD_BYTES_MAX} bytes."
+            detail = (
+                f"The head of the request is larger than {HEAD_BYTES_MAX} bytes or {HEADERS_MAX} headers."
+            )
             self._refuse(ProblemError("headers_too_large", detail))
         else:
             self._refuse(ProblemError("malformed_request", f"{error or msg}."))

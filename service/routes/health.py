@@ -10,7 +10,7 @@ from fastapi.responses import PlainTextResponse, Response
 from biresnerf.wire.problems import FieldProblem
 from biresnerf.wire.service import Health
 from service.http.access import may_scrape
-from service.http.dependencies import CurrentService, Service
+from service.http.dependencies import CurrentService, Service, service_of
 from service.http.metrics import Exposition
 from service.http.problems import ProblemError, declared
 from workers.settings.errors import Unavailable
@@ -22,12 +22,13 @@ _LACKING = (*(f"{need}_unavailable" for need in _NEEDS), "unavailable")
 
 
 @router.get("/livez", responses=declared("unavailable"))
-async def livez(service: CurrentService) -> Health:
+async def livez(request: Request) -> Health:
     """The process runs and responds. Its dependencies are not checked: a restart would not repair them.
 
     503 where it lost connections to a database that answers: a restart repairs that.
     """
-    if service.stores.monitor.broken.is_set():
+    # Not as a dependency, which would need a free thread.
+    if service_of(request).stores.monitor.broken.is_set():
         raise ProblemError(
             "unavailable", "The process lost its connections to the database and has to restart."
         )

@@ -11,6 +11,7 @@ from typing import Any
 import httpx
 import pytest
 
+from service.http import strict_http
 from tests.service.conftest import Running, new_dataset
 
 
@@ -182,3 +183,35 @@ def test_a_body_cut_off_within_a_chunk_leaves_nothing(service: Running, http: ht
         assert time.monotonic() < end
         time.sleep(0.05)
     assert http.get(f"/v1/datasets/{dataset}").json()["files"] == 0
+
+
+def test_more_headers_than_anybody_sends_are_refused(service: Running) -> None:
+    def asking(count: int) -> bytes:
+        return GET + HOST + b"".join(b"X-%d: y\r\n" % number for number in range(count - 1)) + b"\r\n"
+
+    (most,) = answers_to(service, asking(100))
+    assert most[0] == 200
+    (more,) = answers_to(service, asking(101))
+    assert more[0] == 431
+
+
+def test_each_byte_of_a_head_that_comes_byte_by_byte_is_searched_once() -> None:
+    class Received(bytes):
+        searched = 0
+
+        def find(self, what: bytes, start: int = 0) -> int:
+            Received.searched += len(self) - start
+            return super().find(what, start)
+
+    text = GET + HOST + b"X-A: b\r\n" * 90
+    head = strict_http._Head()
+    for length in range(1, len(text) + 1):
+        head.read(Received(text[:length]))
+    assert head.lines == text.count(b"\n")
+    assert Received.searched <= 2 * len(text)
+
+
+def test_heads_of_one_connection_are_each_read_from_their_start(service: Running) -> None:
+    one = GET + HOST + b"Content-Length: 0\r\n"
+    found = answers_to(service, 3 * (one + b"\r\n") + one + b"Content-Length: 0\r\n\r\n")
+    assert [answer[0] for answer in found] == [200, 200, 200, 400]
