@@ -22,6 +22,7 @@ from service.docs import docs_page
 from service.docs.api_description import describe
 from service.http.access import Access, log_access
 from service.http.dependencies import Service
+from service.http.head_answers import HeadAnswers
 from service.http.metrics import WebMetrics
 from service.http.observe import Observed, is_probe
 from service.http.problems import ProblemError, problem_of
@@ -122,6 +123,7 @@ def create_app(settings: Settings) -> FastAPI:
         telemetry={"metrics": False, "logs": False, "operation_spans": False, "exclude": is_probe},
     )
     app.add_middleware(Access, settings=settings)
+    app.add_middleware(HeadAnswers, methods_at=_methods_at)
     app.add_middleware(RequestContext)  # it responds to what Access refuses
     app.add_middleware(Observed, metrics=metrics)
     _answer_with_problems(app)
@@ -180,16 +182,16 @@ def _answer_with_problems(app: FastAPI) -> None:
         answer = _as_problem(error)
         if answer.code == "method_not_allowed":
             # The framework names the methods of the first route at this path only.
-            answer.headers["Allow"] = ", ".join(_methods_at(request))
+            there = set(_methods_at(request.scope["path"]))
+            answer.headers["Allow"] = ", ".join(sorted(there | ({"HEAD"} if "GET" in there else set())))
         return render(answer, request)
 
     for kind in (FaultError, RequestValidationError, HTTPException):
         app.add_exception_handler(kind, problem)
 
 
-def _methods_at(request: Request) -> list[str]:
-    """All methods of the request's path."""
-    path: str = request.scope["path"]
+def _methods_at(path: str) -> list[str]:
+    """All methods that routes have at the path."""
     found: set[str] = set()
     for router in _ROUTERS:
         for route in router.routes:

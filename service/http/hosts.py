@@ -3,6 +3,28 @@
 from __future__ import annotations
 
 import ipaddress
+import re
+
+# Labels as in names of machines and containers; RFC 1123 has no underscore, Compose has.
+_LABEL = r"[A-Za-z0-9](?:[\w-]{0,61}[A-Za-z0-9])?"
+_NAME = re.compile(rf"{_LABEL}(?:\.{_LABEL})*\.?", re.ASCII)
+_PLACE = re.compile(r"(\[[^]]*\]|[^:\[\]]*)(?::[0-9]{1,5})?", re.ASCII)
+
+
+def is_host(text: str) -> bool:
+    """Whether a Host header names a machine: by a name or an IP address, and perhaps a port."""
+    place = _PLACE.fullmatch(text)
+    if place is None or len(text) > 260:
+        return False
+    host = place[1]
+    try:
+        if host.startswith("["):
+            return ipaddress.ip_address(host[1:-1]).version == 6
+        if host.rstrip(".").rpartition(".")[2].isdigit():  # no name ends so, and browsers write addresses out
+            return ipaddress.ip_address(host).version == 4
+    except ValueError:
+        return False
+    return _NAME.fullmatch(host) is not None
 
 
 def on_loopback(host: str) -> bool:

@@ -73,6 +73,7 @@ CATALOGUE: dict[str, tuple[int, str]] = {
     "quota_exhausted": (429, "The tenant's quota is exhausted"),
     "rate_limited": (429, "Too many requests in a short time"),
     "too_many_uploads": (429, "Too many uploads at the same time"),
+    "client_gone": (499, "The client went away"),
     "internal_error": (500, "The service failed"),
     "unavailable": (503, "The service is not ready"),
     "queue_unavailable": (503, "The queue is not available"),

@@ -10,10 +10,11 @@ import uuid
 from urllib.parse import quote, urlsplit
 
 from starlette.datastructures import MutableHeaders
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from service.http.hosts import is_host
 from service.http.problems import MEDIA_TYPE, ProblemError
 from workers.settings.logs import log_context
 
@@ -29,7 +30,6 @@ _SECURITY_HEADERS = {
     "Referrer-Policy": "no-referrer",
 }
 _ID = re.compile(r"^[\w.:-]{1,128}$", re.ASCII)
-_HOST = re.compile(r"^([\w.-]+|\[[0-9a-fA-F:.]+\])(:[0-9]{1,5})?$", re.ASCII)
 
 
 def request_id(request: Request) -> str:
@@ -106,10 +106,13 @@ def _refuse_ambiguous(request: Request) -> None:
         raise ProblemError("malformed_request", detail, headers=close)
     # Where it cannot be parsed, the framework takes the server's own address for it.
     host = request.headers.get("host")
-    if host is not None and not _HOST.match(host):
+    if host is not None and not is_host(host):
         raise ProblemError(
             "malformed_request", "The Host header is no host name.", where="Host", headers=close
         )
+    if len(request.headers.getlist("authorization")) > 1:
+        detail = "Authorization is given twice."
+        raise ProblemError("malformed_request", detail, where="Authorization", headers=close)
     # The parser limits only headers that arrive in pieces; those that arrive at once are measured here.
     head = [request.scope["raw_path"], request.scope["query_string"], *sum(request.scope["headers"], ())]
     if sum(map(len, head)) > HEAD_BYTES_MAX:
@@ -128,9 +131,18 @@ def _refuse_other_pages(request: Request) -> None:
     site, origin = request.headers.get("sec-fetch-site"), request.headers.get("origin")
     ours = site in {"same-origin", "none"}
     if site is None:
-        ours = origin is None or urlsplit(origin).netloc == request.headers.get("host")
+        ours = origin is None or _is_own(origin, request)
     if not ours:
         raise ProblemError("cross_site", "Requests from pages of other origins are refused.", where="Origin")
+
+
+def _is_own(origin: str, request: Request) -> bool:
+    """Whether it is of this host, and no less safe than the request: a proxy before us may be the one that has TLS."""
+    try:
+        page = urlsplit(origin)
+    except ValueError:
+        return False
+    return page.scheme in {"https", request.scope["scheme"]} and page.netloc == request.headers.get("host")
 
 
 def _stopping(request: Request) -> bool:
@@ -139,6 +151,8 @@ def _stopping(request: Request) -> bool:
 
 
 def _unexpected(error: Exception, request: Request) -> ProblemError:
+    if isinstance(error, ClientDisconnect):
+        return ProblemError("client_gone", "The client went away before its request was whole.")
     if isinstance(error, OSError) and error.errno in {errno.ENOSPC, errno.EDQUOT}:
         logger.error("disk full: %s", error)
         return ProblemError("storage_full", "The disk of the service is full.")

@@ -5,9 +5,11 @@ Sizes and counts in the archive's headers are not trusted: bytes and files are c
 
 from __future__ import annotations
 
+import errno
 import gzip
 import os
 import stat
+import struct
 import tarfile
 import zipfile
 import zlib
@@ -65,8 +67,12 @@ def unpack(request: UnpackRequest) -> dict[str, Any]:
                 raise sink.rejected("This is not a zip, tar or tar.gz archive.", hint=_PACK_HINT)
     except (zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise sink.rejected(f"The archive is broken: {error}.") from None
-    except (NotImplementedError, ValueError, OverflowError) as error:
+    except (NotImplementedError, ValueError, OverflowError, IndexError, struct.error) as error:
         raise sink.rejected(f"The archive is damaged or of an unknown kind: {error}.") from None
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # a place before the file's start, which the archive names
+            raise
+        raise sink.rejected("The archive is damaged: it names places outside of itself.") from None
     except MemoryError:
         raise sink.rejected("The archive's table of contents is unreasonably large.") from None
     if sink.files == 0:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+import socket
 import time
 
 import httpx
+import pytest
 
 from tests.service.conftest import Running, new_dataset
 
@@ -48,3 +50,31 @@ def test_probes_are_logged_only_when_they_fail(service: Running, http: httpx.Cli
     http.get("/livez/", headers={"X-Request-ID": "audit-4"})
     line_of(service, "audit-4")
     assert "audit-3" not in service.log.read_text()
+
+
+FORM = "multipart/form-data; boundary=b"
+CUT_OFF = {
+    "a file": ("PUT", "/v1/datasets/{}/files/a", "application/octet-stream", b"x"),
+    "an archive": ("POST", "/v1/datasets/{}/archive", "application/zip", b"PK"),
+    "JSON": ("POST", "/v1/datasets", "application/json", b"{"),
+    "a form": ("POST", "/v1/jobs", FORM, b'--b\r\nContent-Disposition: form-data; name="archive"\r\n\r\nPK'),
+}
+
+
+@pytest.mark.parametrize("body", CUT_OFF)
+def test_a_client_that_goes_away_in_mid_body_is_one_line_and_no_fault_of_ours(
+    service: Running, http: httpx.Client, body: str
+) -> None:
+    method, path, kind, sent = CUT_OFF[body]
+    identity = f"gone-{list(CUT_OFF).index(body)}"
+    head = (
+        f"{method} {path.format(new_dataset(http))} HTTP/1.1\r\nHost: x\r\nX-Request-ID: {identity}\r\n"
+        f"Content-Type: {kind}\r\nContent-Length: 1000\r\n\r\n"
+    )
+    address = http.base_url.host, http.base_url.port
+    with socket.create_connection(address, timeout=10) as line:
+        line.sendall(head.encode() + sent)
+        time.sleep(0.3)
+    assert " 499 [" in line_of(service, identity)
+    assert f"{identity} {method}" not in service.log.read_text(), "no traceback follows"
+    assert 'status="500"' not in http.get("/metrics").text

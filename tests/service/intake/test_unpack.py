@@ -106,3 +106,28 @@ def test_files_that_operating_systems_add_are_left_out(tmp_path: Path):
     asked = request(tmp_path / "archive")
     unpack(asked)
     assert unpacked(asked.into) == FILES
+
+
+def damaged(folder: Path, find: bytes, at: int, change: bytes) -> Path:
+    """A zip with one entry, of whose part that begins with ``find`` some bytes are changed."""
+    path = folder / "archive"
+    write_zip(path, {"a": b"a"})
+    content = bytearray(path.read_bytes())
+    start = content.index(find) + at
+    content[start : start + len(change)] = change
+    path.write_bytes(bytes(content))
+    return path
+
+
+# The name's length in the central directory, and the directory's place at the end of the archive.
+@pytest.mark.parametrize(
+    ("find", "at", "change"),
+    [(b"PK\x01\x02", 28, b"\0\0\1\0"), (b"PK\x05\x06", 16, b"\xff\xff\xff\x7f")],
+    ids=["an entry without a name", "a directory beyond the file"],
+)
+def test_a_damaged_table_of_contents_is_the_archives_fault(
+    tmp_path: Path, find: bytes, at: int, change: bytes
+):
+    with pytest.raises(InputError) as caught:
+        unpack(request(damaged(tmp_path, find, at, change)))
+    assert caught.value.code == "archive_rejected"

@@ -16,7 +16,8 @@ import pytest
 from biresnerf.options.presets import PRESETS
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from service.app import create_app
-from tests.service.conftest import LIMITS, Running, problem, short_folder
+from service.http.hosts import is_host
+from tests.service.conftest import LIMITS, Running, problem, ready_dataset, short_folder, submit
 from tests.service.free_port import free_port
 from workers.database.embedded_postgres import EmbeddedPostgres
 from workers.database.migrate import migrate
@@ -70,7 +71,7 @@ def test_every_wrong_address_or_question_is_a_problem(
     answer = http.request(method, path)
     body = problem(answer, status, code)
     if path == "/v1/jobs" and status == 405:
-        assert answer.headers["allow"] == "GET, POST"
+        assert answer.headers["allow"] == "GET, HEAD, POST"
     if code == "invalid_request":
         assert body["errors"][0]["pointer"].startswith("/query/")
 
@@ -103,6 +104,11 @@ def test_a_page_of_another_port_of_this_machine_is_another_origin(http: httpx.Cl
         {"Origin": "http://127.0.0.1:1"},
         {"Origin": f"http://{host}.evil.example"},
         {"Origin": "null"},
+        {"Origin": "http://[::1"},
+        {"Origin": "http://["},
+        {"Origin": "http://a]b"},
+        {"Origin": f"ftp://{host}"},
+        {"Origin": f"//{host}"},
     ):
         refused = problem(http.post("/v1/datasets", json={}, headers=headers), 403, "cross_site")
         assert refused["where"] == "Origin"
@@ -119,6 +125,8 @@ def test_a_page_of_another_port_of_this_machine_is_another_origin(http: httpx.Cl
         "[::1",
         "",
         "127.0.0.1/../x",
+        *(".", "..", "-", "_", "a..b", "-a", "a-", "2130706433", "127.1", "1.2.3.256", "x" * 64),
+        *("[.]", "[:::::::]", "[127.0.0.1]", "[]"),
     ],
 )
 def test_a_host_that_cannot_be_parsed_is_refused(http: httpx.Client, host: str) -> None:
@@ -291,3 +299,45 @@ def test_a_server_that_cannot_start_says_why(service: Running, tmp_path: Path) -
     port = service.url.rsplit(":", 1)[1]
     assert "BIRESNERF_PORT" in said(DATABASE_URL="postgresql://x", PORT=port)
     assert "BIRESNERF_PORT" in said(PORT="many")
+
+
+@pytest.mark.parametrize(
+    "host",
+    [
+        "localhost",
+        "127.0.0.1:8000",
+        "[::1]:80",
+        "web_1",
+        "my-machine",
+        "poses.example.org.",
+        "3d.example.org",
+    ],
+)
+def test_a_host_that_names_a_machine_is_one(host: str) -> None:
+    assert is_host(host)
+
+
+def test_two_keys_in_one_request_are_refused(http: httpx.Client) -> None:
+    two = [("Authorization", "Bearer brn_a"), ("Authorization", "Bearer brn_b")]
+    assert problem(http.get("/v1/jobs", headers=two), 400, "malformed_request")["where"] == "Authorization"
+
+
+@pytest.mark.parametrize(
+    "path", ["/livez", "/v1/jobs", "/v1/info", "/v1/jobs/job_none", "/openapi.json", "/v1/none"]
+)
+def test_head_answers_as_get_does_but_for_the_body(http: httpx.Client, path: str) -> None:
+    got, asked = http.get(path), http.head(path)
+    assert (asked.status_code, asked.content) == (got.status_code, b"")
+    for header in ("content-type", "content-length", "etag", "cache-control"):
+        if header != "content-length" or got.status_code < 400:  # a problem has the id of its request
+            assert asked.headers.get(header) == got.headers.get(header), header
+
+
+def test_head_of_a_stream_without_end_ends(http: httpx.Client, scene: Path) -> None:
+    job = submit(http, ready_dataset(http, scene), steps=5000)["id"]
+    asked = http.head(f"/v1/jobs/{job}/events", timeout=30)
+    assert asked.status_code == 200
+    assert asked.headers["content-type"].startswith("text/event-stream")
+    assert http.post(f"/v1/jobs/{job}/cancel").status_code < 300, (
+        "it was under way, and the connection goes on"
+    )
