@@ -83,6 +83,9 @@ class ControlPoint(FrozenModel, allow_inf_nan=False):
     error_px: float = Field(
         examples=[0.6], description="Root mean square distance from its marks in the photos."
     )
+    far_off: bool = Field(
+        False, description="Its coordinates or marks are wrong by all that the others show."
+    )
 
 
 class ControlReport(FrozenModel, allow_inf_nan=False):
@@ -107,6 +110,9 @@ class ControlReport(FrozenModel, allow_inf_nan=False):
         None, description="Latitude, longitude, height; None for a frame of metres."
     )
     why_not: str | None = Field(None, examples=["2 control points are seen in two photos, and 3 are needed"])
+    doubt: str | None = Field(
+        None, description="Which points contradict the photos, and by how much; None: none does."
+    )
 
 
 class KnownScale(FrozenModel, allow_inf_nan=False):

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from biresnerf.data.formats.positions.position_priors import position_priors
 from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.dataset import Dataset
-from biresnerf.data.model.measured_places import PositionPriors
-from biresnerf.data.points.located_points import located
+from biresnerf.data.model.measured_places import ControlPoints, PositionPriors
+from biresnerf.data.points.located_points import MOST_FAR_OFF, LocatedPoints, located
 from biresnerf.geometry.earth.geodesy import place_of
 from biresnerf.geometry.earth.georeference import Georeference, NoGeoreference, fit_positions
 from biresnerf.geometry.similarity import Similarity
@@ -85,22 +85,47 @@ def control_report(dataset: Dataset, world_from_cam: NDArray[np.float64]) -> Con
     try:
         found = located(points, world_from_cam, [dataset.camera_of(i) for i in range(len(dataset))])
     except NoGeoreference as reason:
-        return report.model_copy(update={"why_not": str(reason)})
+        doubt = f"{points.source} is not used: {reason}."
+        return report.model_copy(update={"why_not": str(reason), "doubt": doubt})
     images, square = np.bincount(points.point), (found.error_m**2).sum(1)
-    rows = zip(points.names, points.check, images, found.error_m, found.error_px, strict=True)
+    rows = zip(points.names, points.check, images, found.error_m, found.error_px, found.far_off, strict=True)
     each = tuple(
         ControlPoint(
-            name=name, check=bool(check), images=int(count), error_m=tuple(error.tolist()), error_px=float(px)
+            name=name,
+            check=bool(check),
+            images=int(count),
+            error_m=tuple(error.tolist()),
+            error_px=float(px),
+            far_off=bool(far),
         )
-        for name, check, count, error, px in rows
+        for name, check, count, error, px, far in rows
     )
     figures: dict[str, float | None] = {}
     for kind, chosen in (("control", ~points.check), ("check", points.check)):
         for unit, squares in (("m", square), ("px", found.error_px**2)):
             figures[f"{kind}_{unit}"] = float(squares[chosen].mean() ** 0.5) if chosen.any() else None
     return report.model_copy(
-        update={"points": each, "metres_from_world": _matrix(found.metres_from_world), **figures}
+        update={
+            "points": each,
+            "metres_from_world": _matrix(found.metres_from_world),
+            "doubt": _far_off(points, found) or None,
+            **figures,
+        }
     )
+
+
+def _far_off(points: ControlPoints, found: LocatedPoints) -> str:
+    """Names the points that contradict the photos, with their distances; empty where none does."""
+    if not found.far_off.any():
+        return ""
+    apart = np.linalg.norm(found.error_m, axis=1)
+    named = ", ".join(f"{points.names[i]} by {apart[i]:.2f} m" for i in np.flatnonzero(found.far_off))
+    others = apart[~found.far_off]
+    rest = f" (the others by {np.median(others):.2f} m, median)" if len(others) else ""
+    doubt = f"{points.source}: points are not where the photos show them: {named}{rest}."
+    if found.far_off[~points.check].mean() > MOST_FAR_OFF:
+        return f"{doubt} With so many off, none is believed: the frame may be wrong, or x and y swapped."
+    return f"{doubt} Check their coordinates and marks."
 
 
 def _matrix(similarity: Similarity) -> tuple[tuple[float, ...], ...]:

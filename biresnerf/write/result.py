@@ -93,8 +93,8 @@ def write_result(
     )
     report, result = _write_poses(path, scene, returned_dataset, returned, report, field, exports, monitor)
     _write_view_file(path, scene, evaluation, moved or result, surface, poses)
-    if reference is not None and reference.doubt:
-        report = report.model_copy(update={"warnings": (*report.warnings, reference.doubt)})
+    doubts = tuple(each.doubt for each in (reference, control) if each is not None and each.doubt)
+    report = report.model_copy(update={"warnings": (*report.warnings, *doubts)})
     notes = write_report_html(path, report)
     for note in notes:
         logger.warning("%s", note)

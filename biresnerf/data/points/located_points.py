@@ -23,6 +23,11 @@ logger = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 LEAST_POINTS = 3
+# A point is far off by so many medians of the others' distances, px of its photos and stated deviations; or by so many
+# px whatever the others are off by, as where all contradict the photos.
+FAR_OFF, FAR_OFF_PX, FAR_OFF_STATED, FAR_OFF_ANYWAY_PX = 6.0, 8.0, 3.0, 30.0
+MOST_FAR_OFF = 0.25  # of the control points; where more are, none is believed
+FLAT, UPRIGHT = 0.2, 0.9  # of the spread across; the cosine of a level plane's normal
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,18 +38,45 @@ class LocatedPoints:
         metres_from_world: the similarity that carries the control points to their coordinates.
         error_m: [p, 3], where the points are by the cameras less where they were measured, along the axes.
         error_px: [p], root mean square over a point's photos of how far it appears from its mark.
+        far_off: bool [p], see `far_off`.
     """
 
     metres_from_world: Similarity
     error_m: Array
     error_px: Array
+    far_off: NDArray[np.bool_]
+
+
+def far_off(apart_m: Array, px_m: Array, accuracy_m: Array) -> NDArray[np.bool_]:
+    """Points [p] whose coordinates or marks are wrong by all that the others show.
+
+    Args:
+        apart_m: how far each is from where photos show it.
+        px_m: a pixel's size at each.
+        accuracy_m: stated deviations [p, 3]; NaN where there are none.
+    """
+    others = np.array([np.median(np.delete(apart_m, i)) for i in range(len(apart_m))])
+    stated = np.nan_to_num(FAR_OFF_STATED * np.linalg.norm(accuracy_m, axis=1))
+    beyond_others = np.minimum(FAR_OFF * others, FAR_OFF_ANYWAY_PX * px_m)
+    return np.asarray(apart_m > np.maximum.reduce([beyond_others, FAR_OFF_PX * px_m, stated]))
+
+
+def _refuse_mirrored(points: ControlPoints, metres: Array, centres: Array) -> None:
+    """Level points that cameras [m, 3], in metres, see from below: a flat mirror image fits as well as the truth."""
+    _, spread, axes = np.linalg.svd(metres - metres.mean(0))
+    level = spread[2] < FLAT * spread[1] and abs(axes[2, 2]) > UPRIGHT
+    if level and (points.epsg or points.origin) and np.median(centres[:, 2]) < metres[:, 2].mean():
+        raise NoGeoreference(
+            "by the control points the cameras look up at the ground: x and y (or latitude and longitude) seem to be "
+            "swapped"
+        )
 
 
 def located(points: ControlPoints, world_from_cam: Array, cameras: Sequence[Camera]) -> LocatedPoints:
     """The points by cameras [n, 4, 4] that have these lenses [n].
 
     Raises:
-        NoGeoreference: fewer than three control points, or all on a line.
+        NoGeoreference: fewer than three control points, all on a line, or level and seen from below.
     """
     control = ~points.check
     if control.sum() < LEAST_POINTS:
@@ -66,7 +98,13 @@ def located(points: ControlPoints, world_from_cam: Array, cameras: Sequence[Came
         seen[points.image == image] = pixels_of_points(lenses[image], in_cam[points.image == image])
     square = np.bincount(points.point, ((seen - points.xy) ** 2).sum(1)) / np.bincount(points.point)
     found = align_points(xyz[control], points.metres[control])
-    return LocatedPoints(found, found.apply(xyz) - points.metres, np.sqrt(square))
+    _refuse_mirrored(points, points.metres[control], found.apply(poses[control[points.point], :3, 3]))
+    error_m = found.apply(xyz) - points.metres
+    px_m = found.scale * np.linalg.norm(in_cam, axis=1) / focal
+    px_m = np.bincount(points.point, px_m) / np.bincount(points.point)
+    return LocatedPoints(
+        found, error_m, np.sqrt(square), far_off(np.linalg.norm(error_m, axis=1), px_m, points.accuracy_m)
+    )
 
 
 def metres_from_world(

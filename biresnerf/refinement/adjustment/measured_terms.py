@@ -7,10 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.data.points.located_points import MOST_FAR_OFF, far_off
 from biresnerf.geometry.body_offset import SHARED_ERRORS
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.earth.georeference import NORMAL_MEDIAN
-from biresnerf.geometry.similarity import align_points
+from biresnerf.geometry.similarity import Similarity, align_points
 from biresnerf.refinement.adjustment.cameras import POSE, Cameras
 from biresnerf.refinement.adjustment.evidence import Control, Evidence, Positions
 from biresnerf.refinement.adjustment.solver.term import Linearised
@@ -85,6 +86,9 @@ class ControlTerm(TrackTerm):
 
     The similarity between both frames is found anew with each measurement of the noise, so that frame and scale stay
     free; the noise level begins with what the points miss their marks by.
+
+    Attributes:
+        far_off: bool [p], points that contradict the photos by what the last measurement found.
     """
 
     def __init__(self, control: Control, intrinsics: Intrinsics, cameras: Cameras) -> None:
@@ -99,9 +103,17 @@ class ControlTerm(TrackTerm):
         metres_from_world = align_points(self._free, self._control.metres)
         self.place = metres_from_world.inverse().apply(self._control.metres)
         whitened = metres_from_world.scale * metres_from_world.rotation / self._control.deviation[:, :, None]
+        self.far_off = self._far_off(cameras, metres_from_world)
         self.known = np.einsum("pka,pkb->pab", whitened, whitened)
         self.unknowns = self.place.copy()
         return super().measure(cameras)
+
+    def _far_off(self, cameras: Cameras, metres_from_world: Similarity) -> NDArray[np.bool_]:
+        apart_m = np.linalg.norm(metres_from_world.apply(self._free) - self._control.metres, axis=1)
+        away = np.linalg.norm(self._free[self.point] - cameras.centre[self.image], axis=1)
+        px = away / self.lens[self.image, 0]
+        px_m = metres_from_world.scale * np.bincount(self.point, px) / np.bincount(self.point)
+        return far_off(apart_m, px_m, self._control.deviation)
 
     def _measured_noise(self, cameras: Cameras) -> float:
         level = float(np.median(self.errors_px(cameras))) / RAYLEIGH_MEDIAN
@@ -125,6 +137,15 @@ def measured_terms(evidence: Evidence, cameras: Cameras) -> dict[str, PositionTe
     if evidence.control is not None:
         found["control"] = ControlTerm(evidence.control, evidence.intrinsics, cameras)
     return found
+
+
+def control_believed(evidence: Evidence, cameras: Cameras) -> bool:
+    """Whether most control points agree with photos from cameras that were adjusted to them."""
+    if evidence.control is None:
+        return True
+    far = ControlTerm(evidence.control, evidence.intrinsics, cameras)
+    far.measure(cameras)
+    return bool(far.far_off.mean() <= MOST_FAR_OFF)
 
 
 def measured_misfits(rigs: Sequence[tuple[Cameras, Evidence]]) -> dict[str, tuple[Array, NDArray[np.bool_]]]:

@@ -10,12 +10,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.refinement.adjustment.adjustment import NOTHING_FITS, Adjustment, adjust_poses, misfit
 from biresnerf.refinement.adjustment.cameras import Cameras
 from biresnerf.refinement.adjustment.choice import Candidate, choose
 from biresnerf.refinement.adjustment.evidence import Evidence, NoiseLevels, PosePrior
-from biresnerf.refinement.adjustment.measured_terms import measured_misfits
+from biresnerf.refinement.adjustment.measured_terms import control_believed, measured_misfits
 from biresnerf.refinement.adjustment.solver.covariance import NOTHING_KNOWN
 from biresnerf.refinement.finish.candidates import (
     BY_TRACKS,
@@ -33,6 +34,7 @@ from biresnerf.refinement.finish.lens_model import supported_lenses
 from biresnerf.refinement.finish.outcome import Finish, fit_of, heeded, most_heeded
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.scene.scene import Scene
+from biresnerf.report import CandidateName
 
 logger = logging.getLogger(__name__)
 
@@ -51,17 +53,16 @@ def choose_poses(
 
     What the evidence says of the lenses goes to the optimiser's.
     """
-    split = gather_evidence(scene, optimiser)
+    gathered = gather_evidence(scene, optimiser)
     refined = optimiser.poses.poses().numpy()
     if not np.isfinite(refined).all():
         return None
-    loose = np.full(len(refined), PRIOR)
-    loose[split.fitted.held_by_measurements] = NOTHING_KNOWN  # a prior would hold a bend of all cameras
-    prior = PosePrior(refined, loose, loose * optimiser.frame.distance, optimiser.bodies)
     cameras = optimiser.lenses.refined(scene.dataset).cameras
-    lenses = supported_lenses(refined, split.fitted, split.left_out, prior, cameras, announce)
-    split = replace(split, fitted=replace(split.fitted, lenses=lenses))
-    results = adjust(refined, split.fitted, prior, announce)
+    split, prior, results = _adjusted(gathered, refined, optimiser, cameras, announce)
+    heeding = most_heeded(results)
+    if heeding is not None and not _believes_control(heeding, split.fitted):
+        logger.info("control points are not believed: too many contradict the photos")
+        split, prior, results = _adjusted(gathered.without_control(), refined, optimiser, cameras, announce)
     noise = results["adjusted-tracks"].noise if "adjusted-tracks" in results else NoiseLevels()
     if noise.track_px > _most_noise_px(split.fitted):
         logger.info("tracks say nothing: their noise is %.1f px", noise.track_px)
@@ -100,6 +101,29 @@ def choose_poses(
         contradicted_focals(refined, split.fitted, split.left_out, prior, noise, kept, by_tracks),
     )
     return chosen, Finish(choice.reports, fit_of(candidates, results, evidence), given)
+
+
+def _adjusted(
+    split: SplitEvidence,
+    refined: Array,
+    optimiser: JointOptimiser,
+    cameras: Sequence[Camera],
+    announce: Callable[[], None],
+) -> tuple[SplitEvidence, PosePrior, dict[CandidateName, Adjustment]]:
+    """The evidence with the lenses that it supports, what is known before, and the poses adjusted to both."""
+    loose = np.full(len(refined), PRIOR)
+    loose[split.fitted.held_by_measurements] = NOTHING_KNOWN  # a prior would hold a bend of all cameras
+    prior = PosePrior(refined, loose, loose * optimiser.frame.distance, optimiser.bodies)
+    lenses = supported_lenses(refined, split.fitted, split.left_out, prior, cameras, announce)
+    split = replace(split, fitted=replace(split.fitted, lenses=lenses))
+    return split, prior, adjust(refined, split.fitted, prior, announce)
+
+
+def _believes_control(found: Adjustment, evidence: Evidence) -> bool:
+    lenses = evidence.lenses
+    if lenses is not None and found.lenses is not None:
+        lenses = replace(lenses, correction=found.lenses.correction)
+    return control_believed(evidence, Cameras.of(found.world_from_cam, lenses))
 
 
 def _kept_on_a_tie(

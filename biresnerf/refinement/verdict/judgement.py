@@ -16,7 +16,7 @@ from biresnerf.data.workload import JUDGING
 from biresnerf.geometry.focus import focus_point, rms_spread
 from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.refinement.adjustment.cameras import Cameras
-from biresnerf.refinement.adjustment.measured_terms import measured_misfits
+from biresnerf.refinement.adjustment.measured_terms import control_believed, measured_misfits
 from biresnerf.refinement.finish.gather_evidence import measured_evidence
 from biresnerf.refinement.lost.own_matches import contradicted
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
@@ -190,7 +190,8 @@ def _favoured_by_positions(
     new = measured_evidence(refined, after.world_from_cam, placed)
     if old.positions is None or new.positions is None:
         old, new = replace(old, positions=None), replace(new, positions=None)
-    if old.control is None or new.control is None:
+    told = new.control is not None and control_believed(new, Cameras.of(after.world_from_cam))
+    if old.control is None or not told:
         old, new = replace(old, control=None), replace(new, control=None)
     rigs = [
         (Cameras.of(before.world_from_cam), replace(old, positions=new.positions)),
