@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.photos.panoramas.cut_panoramas import as_views
 from biresnerf.data.seeding.map_images import (
     ALL_PAIRS_UP_TO,
     BY_LIKENESS,
@@ -83,6 +84,7 @@ def workload(dataset: Dataset, options: ResolvedOptions, *, unbounded: bool, adj
         unbounded: whether photos show surroundings.
         adjusts: whether all cameras are adjusted at the end.
     """
+    dataset = as_views(dataset)
     matched = options.start in ("auto", "colmap") and can_match()
     weights = step_weights(options, unbounded=unbounded)
     share = steps_share(matched=matched and adjusts)

@@ -6,8 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from biresnerf.data.formats.match_names import match_files
+from biresnerf.data.formats.read_dataset import read_poses
+from biresnerf.data.formats.transforms.write_transforms import TRANSFORMS
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.part_of_set import with_frames
+from biresnerf.data.photos.panoramas.cut_panoramas import PANORAMA_VIEWS
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.options.refine_options import RefineOptions
@@ -25,7 +28,11 @@ def joined_to(dataset: Dataset, options: RefineOptions, result: Path) -> tuple[D
     earlier = load(result)
     pose_of = dict(zip(earlier.names, earlier.poses, strict=True))
     lens_of = dict(zip(earlier.names, earlier.intrinsics, strict=True))
-    found = {name: known for known, name in match_files(earlier.names, dataset.names)[0].items()}
+    if any(name.startswith(f"{PANORAMA_VIEWS}/") for name in earlier.names):
+        pose_of = read_poses(
+            result / TRANSFORMS.in_result
+        )  # has one for each panorama; its views have the others
+    found = {name: known for known, name in match_files(list(pose_of), dataset.names)[0].items()}
     if not found:
         raise InputError(
             "no_common_images",
@@ -40,6 +47,10 @@ def joined_to(dataset: Dataset, options: RefineOptions, result: Path) -> tuple[D
     for index, frame in enumerate(dataset.frames):
         if frame.name in found:
             known = found[frame.name]
+            frame = replace(frame, world_from_cam=pose_of[known], pose_source="given")
+            if known not in lens_of:  # a panorama, which has none
+                frames.append(frame)
+                continue
             number = numbers.setdefault(lens_of[known], len(cameras))
             if number == len(cameras):
                 cameras.append(lens_of[known])
@@ -47,9 +58,7 @@ def joined_to(dataset: Dataset, options: RefineOptions, result: Path) -> tuple[D
             # A file's poses may be of pixels as they are stored, where a photo alone is turned upright.
             shown = (dataset.camera_of(index).width, dataset.camera_of(index).height)
             turned = frame.orientation if shown == (lens_of[known].width, lens_of[known].height) else 1
-            frame = replace(
-                frame, world_from_cam=pose_of[known], pose_source="given", camera=number, orientation=turned
-            )
+            frame = replace(frame, camera=number, orientation=turned)
         frames.append(frame)
     shared = _shared(dataset, [frame.camera for frame in frames])
     joined = [replace(frame, camera=shared.get(frame.camera, frame.camera)) for frame in frames]

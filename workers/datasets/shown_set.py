@@ -13,6 +13,7 @@ from biresnerf.data.given_poses.readings import read_as
 from biresnerf.data.model.dataset import Dataset, Frame
 from biresnerf.data.photos.images import ImageSet, load_images
 from biresnerf.data.photos.masks import mask_place
+from biresnerf.data.photos.panoramas.cut_panoramas import as_views
 from biresnerf.data.show.view_pictures import CELL_PX, THUMBNAIL_PX, write_contact_sheet, write_thumbnail
 from biresnerf.data.workload import can_be_adjusted, workload
 from biresnerf.forecast import latest_machine, remembered_rates
@@ -89,7 +90,7 @@ def expected_seconds(dataset: Dataset, *, unbounded: bool) -> dict[PresetName, f
     """Seconds that a job with each preset would take, on a machine as that of the latest job here."""
     kind, threads = latest_machine() or ("cpu", usable_cores())
     device: ComputeDevice = "cuda" if kind == "cuda" else "cpu"
-    rates, adjusts = remembered_rates(device, threads), can_be_adjusted(len(dataset))
+    rates, adjusts = remembered_rates(device, threads), can_be_adjusted(len(as_views(dataset)))
     return {
         preset: workload(
             dataset, RefineOptions(preset=preset).resolved(device), unbounded=unbounded, adjusts=adjusts

@@ -14,7 +14,7 @@ from workers.jobs.claim import Claim, published_files
 from workers.store.files import FileStore
 
 EXPORTED_FROM = ("poses.json", "colmap/sparse/0/")  # of a result; all other formats can be made from these
-JOINED_TO = ("poses.json", "report.json")  # of a result whose poses stay
+JOINED_TO = ("poses.json", "report.json", "transforms.json")  # of a result whose poses stay
 VIDEO_FRAMES = "video_frames/"  # of a result: photos that its dataset holds as a video
 PANORAMA_VIEWS = "panorama_views/"  # of a result: what was cut from its dataset's panoramas
 

@@ -42,6 +42,7 @@ def inspect_command(
     from biresnerf.data.given_poses.readings import read_as
     from biresnerf.data.model.part_of_set import without_copies, without_photos
     from biresnerf.data.photos.images import load_images
+    from biresnerf.data.photos.panoramas.cut_panoramas import called_panoramas
     from biresnerf.data.photos.turning_object import turning_notes
     from biresnerf.data.photos.video.video_frames import VideoReading
     from biresnerf.field.backends import resolve_here
@@ -51,6 +52,8 @@ def inspect_command(
     missing_names = sorted(name for name in set(options.fixed) if not dataset.called(name))
     dataset = without_copies(without_photos(dataset, options.leave_out))
     dataset = read_as(dataset, options.given_poses)
+    if options.panoramas == "all":
+        dataset = called_panoramas(dataset)
     if pixels:
         with tqdm(total=len(dataset), desc="decoding", unit="photo", leave=False, disable=None) as bar:
             load_images(dataset, options.max_image_size, options.background, lambda _done: bar.update())
@@ -102,12 +105,15 @@ def question_about(dataset: Dataset) -> dict[str, Any] | None:
 def plan(dataset: Dataset, options: ResolvedOptions) -> dict[str, Any]:
     """What `refine` would do with these options."""
     from biresnerf.data.photos.images import working_size
+    from biresnerf.data.photos.panoramas.cut_panoramas import as_views
 
+    views = as_views(dataset)
     sizes = [
         working_size(camera.width, camera.height, options.max_image_size)
-        for camera in map(dataset.camera_of, range(len(dataset)))
+        for camera in map(views.camera_of, range(len(views)))
     ]
     return {
+        "views": len(views),
         "preset": options.preset,
         "start": start_in_words(dataset, options),
         "steps": options.steps,
@@ -199,6 +205,7 @@ def _lines(found: dict[str, Any]) -> list[str]:
     lines += [
         f"refine --preset {wanted['preset']} would",
         f"  start from: {wanted['start']}",
+        *([f"  cut panoramas: {wanted['views']} views"] if wanted["views"] > found["images"] else []),
         f"  take {wanted['steps']} steps on photos of up to {width} x {height} px"
         f" ({wanted['photo_bytes'] / 2**20:.0f} MiB of pixels)",
     ]

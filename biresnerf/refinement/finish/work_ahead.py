@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.images import load_images
+from biresnerf.data.photos.panoramas.cut_panoramas import as_views
 from biresnerf.data.workload import ADJUSTMENT, after_steps, step_weights, steps_share, workload
 from biresnerf.forecast import Forecast, Phase
 from biresnerf.options.refine_options import ResolvedOptions
@@ -22,7 +23,7 @@ def expect_run(forecast: Forecast, dataset: Dataset, options: ResolvedOptions) -
     """All of a run, as far as it is known before its features are."""
     few = replace(dataset, frames=dataset.frames[:PHOTOS_LOOKED_AT])
     unbounded = load_images(few, SMALL, options.background).background is None
-    adjusts = adjusts_cameras(dataset, find_method(options.method))
+    adjusts = adjusts_cameras(as_views(dataset), find_method(options.method))
     work = workload(dataset, options, unbounded=unbounded, adjusts=adjusts)
     forecast.step_weights, forecast.share = dict(work.step_weights), work.share
     forecast.left |= work.amounts

@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 from biresnerf.data.model import colmap_scene as colmap
 from biresnerf.data.model.pose_validation import MAX_COORDINATE, MAX_POINT_COORDINATE
 from biresnerf.errors import InputError
-from biresnerf.geometry.camera.camera_models import COLMAP_MODELS, MODEL_IDS, MODEL_PARAMETERS, Camera
+from biresnerf.geometry.camera.camera_models import (
+    COLMAP_MODELS,
+    MODEL_IDS,
+    MODEL_PARAMETERS,
+    PANORAMA,
+    Camera,
+)
 from biresnerf.geometry.camera.lens import lens_problem
 
 MAX_SIDE_PX = 10**6
@@ -60,11 +66,17 @@ def model_name_of_id(model_id: int, where: str) -> str:
 def supported_model(name: str, where: str) -> str:
     """``name`` itself. Raises InputError ``camera_model_unsupported``."""
     if name not in MODEL_IDS:
+        hint = f"Supported are {', '.join(MODEL_IDS)}; undistort the images with COLMAP's image_undistorter."
+        if name == PANORAMA:
+            hint = (
+                "Give the panoramas alone, and their poses are found; or give the poses in a transforms.json with "
+                f'"camera_model": "{PANORAMA}".'
+            )
         raise InputError(
             "camera_model_unsupported",
             f"the camera model {name[:40]} is not supported.",
             where=where,
-            hint=f"Supported are {', '.join(MODEL_IDS)}; undistort the images with COLMAP's image_undistorter.",
+            hint=hint,
         )
     return name
 

@@ -17,6 +17,7 @@ from biresnerf.data.formats.positions.position_table import WGS84, frame_of
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.measured_places import ControlPoints
 from biresnerf.data.model.untrusted_file import read_text
+from biresnerf.data.photos.panoramas.cut_panoramas import place_in_view
 from biresnerf.errors import InputError
 from biresnerf.geometry.earth.geodesy import east_north_up
 
@@ -55,18 +56,22 @@ def control_points(dataset: Dataset) -> ControlPoints | None:
     Raises:
         InputError: ``control_points_invalid``, with the line; or a code of `decode`, where it names markers.
     """
-    file = next(iter(control_files(dataset.root)), None)
+    given = dataset if dataset.cut is None else dataset.cut.whole
+    file = next(iter(control_files(given.root)), None)
     if dataset.control is not None or file is None:
         return dataset.control
     rows, degrees, epsg = _rows_of(file)
-    found, _ = match_files(list(dict.fromkeys(row.image for row in rows if row.image)), dataset.file_names)
-    frame = {name: dataset.file_names.index(known) for name, known in found.items()}
+    found, _ = match_files(list(dict.fromkeys(row.image for row in rows if row.image)), given.file_names)
+    frame = {name: given.file_names.index(known) for name, known in found.items()}
     names = list(dict.fromkeys(row.name for row in rows))
     first = [next(row for row in rows if row.name == name) for name in names]
     for row in rows:
         if row.place != first[names.index(row.name)].place:
             raise _invalid(row.where, f"has other coordinates of {row.name[:100]!r} than a line before.")
-    seen = {(names.index(row.name), frame[row.image]): row.xy for row in rows if row.image in frame}
+    seen = {}
+    for row in rows:
+        if row.image in frame and (shown := place_in_view(dataset, frame[row.image], row.xy)) is not None:
+            seen[names.index(row.name), shown[0]] = shown[1]
     if markers := _markers(rows):
         seen |= {(names.index(name), at): xy for (name, at), xy in marked(dataset, markers).items()}
     if not seen:

@@ -99,6 +99,35 @@ def cut_panoramas(dataset: Dataset, folder: Path, on_photo: Callable[[int], obje
     )
 
 
+def as_views(dataset: Dataset) -> Dataset:
+    """A set like that which `cut_panoramas` makes, for forecasts: its frames have no photos of their own."""
+    cameras = tuple(_face_camera(camera) if camera.panorama else camera for camera in dataset.cameras)
+    times = [len(_FACES) if dataset.camera_of(i).panorama else 1 for i in range(len(dataset))]
+    frames = tuple(f for f, count in zip(dataset.frames, times, strict=True) for _ in range(count))
+    return replace(dataset, cameras=cameras, frames=frames)
+
+
+def place_in_view(
+    dataset: Dataset, row: int, xy: tuple[float, float]
+) -> tuple[int, tuple[float, float]] | None:
+    """The frame that shows a place (px) of frame ``row`` of the set before it was cut, and where; None where none."""
+    cut = dataset.cut
+    if cut is None:
+        return row, xy
+    views, camera = np.flatnonzero(cut.rows == row), cut.whole.camera_of(row)
+    if not camera.panorama:
+        return int(views[0]), xy
+    east, down = (2 * xy[0] / camera.width - 1) * np.pi, (xy[1] / camera.height - 0.5) * np.pi
+    ray = np.array([np.cos(down) * np.sin(east), np.sin(down), np.cos(down) * np.cos(east)])
+    in_views = cut.cam_from_whole[views, :3, :3] @ ray
+    best = int(np.argmax(in_views[:, 2]))
+    x, y, z = in_views[best].tolist()
+    if z <= 0 or max(abs(x), abs(y)) > z * (1 + 1e-9):
+        return None  # in a view that a mask hides
+    half = camera.width // 4 / 2
+    return int(views[best]), (half * (1 + x / z), half * (1 + y / z))
+
+
 def _face_camera(panorama: Camera) -> Camera:
     """As many pixels around as the panorama has."""
     side = panorama.width // 4

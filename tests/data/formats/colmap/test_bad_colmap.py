@@ -9,6 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from biresnerf.data.formats.colmap.model_checks import model_name_of_id
 from biresnerf.data.formats.colmap.read_model import read_colmap_model
 from biresnerf.data.model.colmap_scene import ColmapModel
 from biresnerf.errors import InputError
@@ -233,3 +234,11 @@ def test_no_change_of_words_makes_the_text_reader_fail_otherwise_than_by_an_inpu
     write_tables(tmp_path, tables | {table: " ".join(words)})
     with contextlib.suppress(InputError):
         assert isinstance(read_colmap_model(tmp_path), ColmapModel)
+
+
+def test_a_model_of_panoramas_is_refused_with_the_way_to_give_their_poses():
+    with pytest.raises(InputError) as caught:
+        model_name_of_id(17, "cameras.bin")
+    assert caught.value.code == "camera_model_unsupported"
+    assert "transforms.json" in caught.value.hint
+    assert "image_undistorter" not in caught.value.hint

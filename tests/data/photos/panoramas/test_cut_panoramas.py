@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from PIL import Image
 
 from biresnerf.data.formats.codec import WriteContext
 from biresnerf.data.formats.colmap.read_model import read_colmap_model
+from biresnerf.data.formats.positions.control_points import control_points
 from biresnerf.data.formats.positions.position_priors import position_priors
 from biresnerf.data.formats.read_dataset import read_dataset, read_poses
 from biresnerf.data.formats.registry import ALL_CODECS
@@ -25,13 +27,18 @@ from biresnerf.data.photos.panoramas.cut_panoramas import called_panoramas, cut_
 from biresnerf.data.seeding.seed_poses import seed_poses
 from biresnerf.data.synthetic.captures import TABLE_SCENE, table_textures, write_panoramas
 from biresnerf.data.synthetic.scene import render_shapes
+from biresnerf.data.workload import workload
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import pose_error
 from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.options.refine_options import RefineOptions
+from biresnerf.pipeline import refine_poses
 from biresnerf.refinement.parameters.rigid_bodies import rigid_bodies
+from biresnerf.run.photos_added import joined_to
+from biresnerf.write.georeference import control_report
+from tests.refinement.tiny_scene import tiny_run
 
 WIDTH, VIEWS, FACES = 256, 3, 6
 
@@ -228,3 +235,46 @@ def test_what_no_format_of_lenses_can_hold_is_refused_by_name(made, tmp_path):
     convert(read_dataset(made), ["transforms", "tum"], tmp_path / "b")
     again = read_dataset(tmp_path / "b" / "transforms.json")
     np.testing.assert_array_equal(again.world_from_cam, read_dataset(made).world_from_cam)
+
+
+def test_control_points_marked_in_panoramas_are_seen_in_their_views(made, tmp_path):
+    folder = tmp_path / "in"
+    shutil.copytree(made, folder)
+    whole = read_dataset(folder)
+    places = np.array([[2.0, 1.0, 0.3], [-1.0, 2.0, 0.5], [0.5, -2.0, 0.1], [0.2, 0.1, -1.0]])
+    rows = ["name,x,y,z,image,px,py"]
+    for frame in whole.frames:
+        seen = (places - frame.world_from_cam[:3, 3]) @ frame.world_from_cam[:3, :3]
+        for number, (place, (x, y, z)) in enumerate(zip(places, seen, strict=True)):
+            # As docs/conventions.md has a panorama.
+            px = WIDTH * (np.arctan2(x, z) / (2 * np.pi) + 0.5)
+            py = WIDTH / 2 * (np.arctan2(y, np.hypot(x, z)) / np.pi + 0.5)
+            at = ",".join(f"{value:.9f}" for value in (*place, px, py))
+            x_y_z, marks = at.split(",")[:3], at.split(",")[3:]
+            rows.append(",".join([f"p{number}", *x_y_z, frame.name, *marks]))
+    (folder / "gcp.csv").write_text("\n".join(rows))
+    dataset = cut(read_dataset(folder), tmp_path / "out")
+    dataset = replace(dataset, control=control_points(dataset))
+    assert len(dataset.control.image) == len(places) * VIEWS
+    report = control_report(dataset, dataset.world_from_cam)
+    assert report.control_m < 1e-5
+    assert report.control_px < 1e-4
+
+
+def test_a_forecast_counts_the_views(made, tmp_path):
+    whole, options = read_dataset(made), RefineOptions(preset="fast").resolved("cpu")
+    foretold = workload(whole, options, unbounded=True, adjusts=True)
+    views = workload(cut(whole, tmp_path), options, unbounded=True, adjusts=True)
+    assert foretold == views
+
+
+@pytest.mark.slow
+def test_panoramas_of_an_earlier_result_keep_their_poses(made, tmp_path):
+    report = refine_poses(made, tmp_path / "out", tiny_run(start="given", verdict=False))
+    assert len(report.images) == VIEWS * FACES
+    shutil.copytree(made / "images", tmp_path / "more/images")
+    joined, options = joined_to(read_dataset(tmp_path / "more"), RefineOptions(), tmp_path / "out")
+    assert set(options.fixed) == {"images/000.jpg", "images/001.jpg", "images/002.jpg"}
+    kept = read_poses(tmp_path / "out/transforms.json")
+    np.testing.assert_array_equal(joined.world_from_cam, np.stack([*kept.values()]))
+    assert all(camera.panorama for camera in joined.cameras)
