@@ -8,6 +8,7 @@ import hashlib
 import logging
 import uuid
 from collections.abc import AsyncIterator
+from functools import partial
 from pathlib import Path
 
 from biresnerf.errors import FaultError
@@ -36,11 +37,22 @@ async def import_archive(
 ) -> DatasetView:
     """Unpacks ``archive``, which is alone in a staging folder, in a child process; then stores what came out.
 
-    ``upload_id``: the upload that it came by. Nothing is stored unless the whole archive is good.
+    ``upload_id``: the upload that it came by. All of its files are added, or none. Closing the dataset waits.
 
     Raises:
         ProblemError: what is wrong with the archive, and with which entry.
     """
+    datasets = service.stores.datasets
+    async with datasets.importing(dataset_id):
+        root = await _unpacked(service, dataset_id, archive)
+        files = await asyncio.to_thread(_files_below, root)
+        contents = {path.relative_to(root).as_posix(): partial(_chunks, path) for path in files}
+        await datasets.add_files(dataset_id, contents, upload_id=upload_id)
+    return await datasets.get(dataset_id)
+
+
+async def _unpacked(service: Service, dataset_id: str, archive: Path) -> Path:
+    """The folder of what the archive holds."""
     settings = service.settings
     dataset = await service.stores.datasets.get(dataset_id)
     if dataset.state != "open":
@@ -72,11 +84,7 @@ async def import_archive(
         if error.code == "archive_too_large" and room < allowed:
             raise ProblemError("storage_full", "There is no room to unpack the archive.") from None
         raise
-    root = await asyncio.to_thread(content_root, into)
-    for path in await asyncio.to_thread(_files_below, root):
-        name = path.relative_to(root).as_posix()
-        await service.stores.datasets.add_file(dataset_id, name, _chunks(path), upload_id=upload_id)
-    return await service.stores.datasets.get(dataset_id)
+    return await asyncio.to_thread(content_root, into)
 
 
 def content_root(folder: Path) -> Path:
@@ -165,7 +173,7 @@ async def _add_to_dataset(service: Service, upload: Upload) -> None:
 
 
 async def import_received(service: Service, dataset_id: str) -> None:
-    """Waits until everything received is in the dataset.
+    """Waits until everything received is in the dataset, also what other requests have just sent.
 
     Raises:
         ProblemError: ``dataset_not_complete`` where an upload is unfinished; what was wrong with another.
@@ -173,7 +181,7 @@ async def import_received(service: Service, dataset_id: str) -> None:
     while True:
         pending = await service.stores.uploads.of_dataset(dataset_id)
         received = [upload for upload in pending if upload.state == "received"]
-        if not received:
+        if not received and not await service.stores.datasets.being_imported(dataset_id):
             break
         for upload in received:
             await import_upload(service, upload.id)

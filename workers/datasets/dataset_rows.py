@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 
 from biresnerf.errors import InputError
 from biresnerf.wire.datasets import DatasetState
@@ -66,6 +67,52 @@ async def record_file(
     return DatasetFile.model_validate(await cursor.fetchone()), before is None
 
 
+async def record_files(
+    connection: Connection,
+    settings: Settings,
+    dataset_id: str,
+    stored: Mapping[str, StoredFile],
+    upload_id: str | None = None,
+) -> None:
+    """Make stored files, by their paths, the dataset's, whose row is locked. What was there is trash.
+
+    Raises `LimitReached` (``too_many_files``, ``body_too_large``).
+    """
+    paths, files = list(stored), list(stored.values())
+    total = sum(file.size for file in files)
+    others = await connection.only_row(
+        "SELECT count(*) AS files, coalesce(sum(size), 0)::bigint AS bytes"
+        " FROM dataset_files WHERE dataset_id = %s AND path <> ALL(%s)",
+        *(dataset_id, paths),
+    )
+    _require_limits(settings, others["files"] + len(paths), others["bytes"] + total)
+    if upload_id is not None:
+        await connection.execute(
+            "UPDATE uploads SET brought = least(size, brought + %s) WHERE id = %s", (total, upload_id)
+        )
+    await connection.execute(
+        "WITH gone AS (DELETE FROM dataset_files WHERE dataset_id = %s AND path = ANY(%s) RETURNING path, key)"
+        " INSERT INTO trash (prefix) SELECT left(key, length(key) - length(path) - 1) FROM gone",
+        (dataset_id, paths),
+    )
+    await connection.execute(
+        "INSERT INTO dataset_files (dataset_id, path, key, size, sha256)"
+        " SELECT %s, * FROM unnest(%s::text[], %s::text[], %s::bigint[], %s::text[])",
+        (
+            *(dataset_id, paths, [file.key for file in files]),
+            *([file.size for file in files], [file.sha256 for file in files]),
+        ),
+    )
+    await connection.execute("UPDATE datasets SET revision = revision + 1 WHERE id = %s", (dataset_id,))
+
+
+def _require_limits(settings: Settings, files: int, size: int) -> None:
+    if files > settings.max_files:
+        raise LimitReached("too_many_files", f"A dataset holds at most {settings.max_files} files.")
+    if size > settings.max_dataset_bytes:
+        raise LimitReached("body_too_large", f"A dataset holds at most {settings.max_dataset_bytes} bytes.")
+
+
 async def require_open(connection: Connection, dataset_id: str, tenant: str | None) -> None:
     """Locks the dataset's row; raises `NotFound`, `Conflict` (``dataset_not_open``)."""
     state = await lock_dataset(connection, dataset_id, tenant)
@@ -88,10 +135,7 @@ async def require_place(
     )
     if row["same"] and not overwrite:
         raise Conflict("file_exists", f"{path} is there already.")
-    if row["files"] >= settings.max_files:
-        raise LimitReached("too_many_files", f"A dataset holds at most {settings.max_files} files.")
-    if row["bytes"] + size > settings.max_dataset_bytes:
-        raise LimitReached("body_too_large", f"A dataset holds at most {settings.max_dataset_bytes} bytes.")
+    _require_limits(settings, row["files"] + 1, row["bytes"] + size)
     return int(row["bytes"])
 
 

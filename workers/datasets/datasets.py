@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterable, Awaitable, Callable, Sequence
+import uuid
+from collections.abc import AsyncIterable, AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from typing import Any
 
 from psycopg.types.json import Jsonb
@@ -23,6 +24,7 @@ from workers.datasets.dataset_rows import (
     file_key,
     lock_dataset,
     record_file,
+    record_files,
     require_open,
     require_place,
 )
@@ -30,7 +32,7 @@ from workers.jobs.job_rows import jobs_of_dataset
 from workers.jobs.quotas import require_byte_quota
 from workers.process.waiting import retry_while_unavailable
 from workers.records import NEWEST_FIRST, DatasetFile, newest_first, page_of, record_from_row, shown_key
-from workers.settings.errors import Conflict, Expired, LimitReached, NotFound
+from workers.settings.errors import Conflict, Expired, LimitReached, NotFound, Unavailable
 from workers.settings.settings import Settings
 from workers.store.files import FileStore, StoredFile
 from workers.store.trash import delete_unless_rescued, discard, rescue
@@ -112,6 +114,70 @@ class DatasetStore(OwnedStore):
             return await self._files.put(key, chunks, limit_bytes=room, expected_sha256=sha256)
 
         return await self._add(dataset_id, path, stored, upload_id, overwrite=overwrite)
+
+    async def add_files(
+        self,
+        dataset_id: str,
+        contents: Mapping[str, Callable[[], AsyncIterable[bytes]]],
+        *,
+        upload_id: str | None = None,
+    ) -> None:
+        """Store files under their relative paths: all, or none where one cannot be.
+
+        Raises as `add_file` does. A file that is there is replaced.
+        """
+        folder = f"datasets/{dataset_id}/files/{new_id('v')}"
+        # A folder for each: the one of a file that is replaced goes to the trash.
+        keys = {path: file_key(f"{folder}/{number}", path) for number, path in enumerate(contents)}
+        async with self._database.transaction() as connection:
+            await require_open(connection, dataset_id, self._tenant)
+            await require_byte_quota(connection, dataset_id, 1 if upload_id is None else 0)
+            await discard(connection, folder, after_s=self._settings.upload_expiry_s)
+        limit, stored = self._settings.max_file_bytes, {}
+        try:
+            for path, content in contents.items():
+                stored[path] = await self._files.put(keys[path], content(), limit_bytes=limit)
+            async with self._database.transaction() as connection:
+                await require_open(connection, dataset_id, self._tenant)
+                await rescue(connection, folder)
+                await record_files(connection, self._settings, dataset_id, stored, upload_id)
+                await require_byte_quota(connection, dataset_id, 0)
+        except BaseException:
+            await delete_unless_rescued(self._database, self._files, folder)
+            raise
+
+    @contextlib.asynccontextmanager
+    async def importing(self, dataset_id: str) -> AsyncIterator[None]:
+        """While inside, `being_imported` says so, also to other processes."""
+        token = uuid.uuid4()
+
+        async def sign_of_life() -> None:
+            await self._database.fetch(
+                "INSERT INTO dataset_imports (token, dataset_id, live_until)"
+                " SELECT %s, id, clock_timestamp() + make_interval(secs => %s) FROM datasets WHERE id = %s"
+                " ON CONFLICT (token) DO UPDATE SET live_until = excluded.live_until",
+                *(token, 2 * self._settings.beat_s, dataset_id),
+            )
+
+        async def go_on() -> None:
+            while True:
+                await asyncio.sleep(self._settings.beat_s / 2)
+                with contextlib.suppress(Unavailable):  # the next time will do
+                    await sign_of_life()
+
+        await sign_of_life()
+        living = asyncio.create_task(go_on())
+        try:
+            yield
+        finally:
+            living.cancel()
+            with contextlib.suppress(Unavailable):  # then it ends by itself
+                await self._database.fetch("DELETE FROM dataset_imports WHERE token = %s", token)
+
+    async def being_imported(self, dataset_id: str) -> bool:
+        """Whether an archive is being brought into the dataset."""
+        sql = "SELECT 1 FROM dataset_imports WHERE dataset_id = %s AND live_until > clock_timestamp() LIMIT 1"
+        return bool(await self._database.fetch(sql, dataset_id))
 
     async def add_copy(
         self,
