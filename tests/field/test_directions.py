@@ -16,6 +16,8 @@ OPENCV = Camera("OPENCV", 320, 240, (300.0, 310.0, 160.0, 118.0, -0.12, 0.03, 0.
 FULL = (252.0, 252.0, 160.0, 120.0, 0.52, -2.69, 0.0006, -0.0002, 1.5, 0.4, -2.5, 1.43)
 FISHEYE = Camera("OPENCV_FISHEYE", 320, 240, (110.0, 108.0, 160.0, 118.0, 0.02, -0.004, 0.001, -0.0002))
 
+CARRIED = Camera("EUCM", 320, 240, (110.0, 108.0, 160.0, 118.0, 0.6, 1.1))
+
 
 @pytest.fixture(params=["cpu", "cuda"])
 def kernel(request: pytest.FixtureRequest):
@@ -36,6 +38,7 @@ def kernel(request: pytest.FixtureRequest):
         (OPENCV, PINHOLE),
         (OPENCV, Camera("FULL_OPENCV", 320, 240, FULL)),
         (FISHEYE, OPENCV),
+        (CARRIED, OPENCV),
     ],
 )
 def test_directions_equal_those_of_the_geometry(kernel, cameras):

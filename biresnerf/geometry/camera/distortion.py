@@ -7,7 +7,8 @@ its angle from the axis, in radians and in its own direction, for a fisheye. Wit
     y' = y g(r²) + 2 p2 x y + p1 (r² + 2 y²) + sy1 r²
     g(s) = (1 + a1 s + a2 s² + a3 s³ + a4 s⁴) / (1 + b1 s + b2 s² + b3 s³)
 
-which is COLMAP's FULL_OPENCV with a = (k1, k2, k3), b = (k4, k5, k6) and its THIN_PRISM_FISHEYE with a = (k1, ..., k4).
+which is COLMAP's FULL_OPENCV with a = (k1, k2, k3), b = (k4, k5, k6) and its THIN_PRISM_FISHEYE with a = (k1, ..., k4)
+and b = 0.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ def coefficients_of(full: FullParameters) -> Coefficients:
     """The coefficients of either family of lenses in their common form, none left out: 4, 3 and 4."""
     across = (full.p1, full.p2, full.sx1, full.sy1)
     if full.fisheye:
-        return Coefficients((full.k1, full.k2, full.k3, full.k4), (0.0, 0.0, 0.0), across)
+        return Coefficients((full.k1, full.k2, full.k3, full.k4), (full.b1, full.b2, full.b3), across)
     below = (full.k4, full.k5, full.k6)
     return Coefficients((full.k1, full.k2, full.k3, 0.0), below, across)
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.model.dataset import Dataset, IntrinsicsSource
-from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS, Camera
+from biresnerf.geometry.camera.camera_models import REFINED_PARAMETERS, Camera
 from biresnerf.geometry.camera.lens import lens_problem
 from biresnerf.options.refine_options import RefineIntrinsics
 from biresnerf.refinement.adjustment.adjustment import Adjustment, adjust_poses, misfit
@@ -67,7 +67,7 @@ def lenses_before(dataset: Dataset, option: RefineIntrinsics) -> Lenses:
             deviation[i, CENTRE] = CENTRE_DEVIATION * max(camera.width, camera.height) / lens.fx
             deviation[i, ASPECT] = ASPECT_DEVIATION
             if source == "given":
-                names = MODEL_PARAMETERS[camera.model]
+                names = REFINED_PARAMETERS[camera.model]
                 lacking = [number for number, name in OF_MODELS.items() if name not in names]
                 deviation[i, lacking] = 0.0
     return _lenses(dataset, deviation)

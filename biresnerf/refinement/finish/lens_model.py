@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS, Camera
+from biresnerf.geometry.camera.camera_models import REFINED_PARAMETERS, Camera
 from biresnerf.refinement.adjustment.adjustment import Adjustment, adjust_poses, track_term
 from biresnerf.refinement.adjustment.cameras import POSE, Cameras
 from biresnerf.refinement.adjustment.evidence import Evidence, PosePrior
@@ -46,7 +46,7 @@ def supported_lenses(
     if lenses is None:
         return None
     simple = np.zeros_like(lenses.free)
-    simple[:, FOCAL], simple[:, K1] = True, ["k1" in MODEL_PARAMETERS[camera.model] for camera in cameras]
+    simple[:, FOCAL], simple[:, K1] = True, ["k1" in REFINED_PARAMETERS[camera.model] for camera in cameras]
     kept = lenses.held(~simple)
     if not (lenses.free & ~simple).any():
         return lenses

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Literal
 
 import torch
 from torch import Tensor
 
-from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS, Camera, FullParameters, smallest_model
+from biresnerf.geometry.camera.camera_models import REFINED_PARAMETERS, Camera, FullParameters
 
 RefinedPart = Literal["none", "focal", "all"]
 
@@ -44,7 +43,7 @@ def free_columns(camera: Camera, part: RefinedPart) -> Tensor:
         return free
     free[FOCAL] = True
     if part == "all":
-        names, fisheye = MODEL_PARAMETERS[camera.model], camera.full().fisheye
+        names, fisheye = REFINED_PARAMETERS[camera.model], camera.full().fisheye
         free[ASPECT] = "fx" in names
         free[CENTRE] = True
         for place in _OF_FISHEYES if fisheye else _OF_OTHERS:
@@ -75,8 +74,7 @@ def moved_camera(camera: Camera, increments: Tensor, unit: Tensor) -> Camera:
         cy=p.cy + float(q[3]) * p.fy,
         **coefficients,
     )
-    model, params = smallest_model(moved, camera.model)
-    return replace(camera, model=model, params=params)
+    return camera.with_lens(moved)
 
 
 def increments_between(before: Camera, after: Camera, unit: Tensor) -> Tensor:

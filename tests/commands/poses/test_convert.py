@@ -17,6 +17,7 @@ from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.formats.simple.poses_json import matrix_of, read_poses_json
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.errors import InputError
+from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS
 from biresnerf.options.formats import formats
 from tests.data.formats.random_sets import random_poses
 from tests.data.formats.simple import trajectories
@@ -214,3 +215,24 @@ def test_a_distorted_lens_is_not_written_where_distortion_cannot_be(tmp_path: Pa
     refused = run(tmp_path / "scene", tmp_path / "out", "--to", "llff", *BOUNDS)
     assert isinstance(refused.exception, InputError)
     assert "it is distorted" in str(refused.exception)
+
+
+@pytest.mark.parametrize("form", ["colmap", "colmap-text", "transforms"])
+@pytest.mark.parametrize(
+    "shape", [{"FOV": (0.9,)}, {"DIVISION": (-0.2,)}, {"EUCM": (0.6, 1.1)}], ids=["FOV", "DIVISION", "EUCM"]
+)
+def test_a_lens_of_another_formula_is_kept_to_the_bit(
+    tmp_path: Path, form: str, shape: dict[str, tuple[float, ...]]
+) -> None:
+    write_set(tmp_path / "given", seed=1, count=4)
+    path = tmp_path / "given" / "transforms.json"
+    document = json.loads(path.read_text())
+    del document["k1"]
+    [(model, values)] = shape.items()
+    named = dict(zip(MODEL_PARAMETERS[model][4:], values, strict=True))
+    path.write_text(json.dumps(document | named | {"camera_model": model, "fl_y": 18.1}))
+    converted(tmp_path / "given", tmp_path / "model", "--to", "colmap")
+    converted(tmp_path / "model" / PLACES["colmap"], tmp_path / "there", "--to", form)
+    converted(tmp_path / "there" / PLACES[form], tmp_path / "back", "--to", "colmap")
+    [camera] = read_colmap_model(tmp_path / "back" / "sparse" / "0").cameras.values()
+    assert (camera.model, camera.params) == (model, (18.0, 18.1, 10.0, 8.0, *values))

@@ -24,6 +24,8 @@ from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.geometry.similarity import Similarity
 
 WIDTH, HEIGHT = 64, 48
+# About which the parameters lie that are no coefficients.
+SHAPES = {"omega": 0.8, "alpha": 0.6, "beta": 1.1}
 
 
 def random_camera(
@@ -38,7 +40,7 @@ def random_camera(
         if name.startswith("f"):
             params.append(width * rng.uniform(0.9, 1.3))
         else:
-            params.append(values.get(name, rng.uniform(-0.01, 0.01)))
+            params.append(values.get(name, SHAPES.get(name, 0.0) + rng.uniform(-0.01, 0.01)))
     return Camera(chosen, width, height, tuple(float(value) for value in params))
 
 

@@ -18,7 +18,7 @@ from biresnerf.data.formats.transforms.write_transforms import transforms_notes,
 from biresnerf.data.model.dataset import Dataset, Frame, SourceFormat
 from biresnerf.data.model.refined_set import refined_set
 from biresnerf.errors import InputError
-from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS, Camera
+from biresnerf.geometry.camera.camera_models import FAMILY_MODELS, MODEL_PARAMETERS, Camera
 from biresnerf.geometry.perturb import perturb_poses
 from tests.data.formats.random_sets import random_camera, random_model, random_poses, random_result
 from tests.data.formats.readers import ours, seen_points, through_json_frame
@@ -55,7 +55,7 @@ def lint_for_nerfstudio(document):
     assert len({frame["file_path"] for frame in document["frames"]}) == len(document["frames"])
 
 
-@pytest.mark.parametrize("model", sorted(set(MODEL_PARAMETERS) - {"FULL_OPENCV", "THIN_PRISM_FISHEYE"}))
+@pytest.mark.parametrize("model", sorted(set(FAMILY_MODELS) - {"FULL_OPENCV", "THIN_PRISM_FISHEYE"}))
 @pytest.mark.parametrize("several", [False, True])
 def test_nerfstudio_sees_points_where_we_do(tmp_path, model, several):
     dataset = posed_dataset(*[model] * (2 if several else 1))
@@ -69,7 +69,7 @@ def test_nerfstudio_sees_points_where_we_do(tmp_path, model, several):
         assert np.abs(through_json_frame(document, frame, points) - ours(result, index, points)).max() < 0.01
 
 
-@pytest.mark.parametrize("model", sorted(MODEL_PARAMETERS))
+@pytest.mark.parametrize("model", sorted(FAMILY_MODELS))
 @pytest.mark.parametrize("several", [False, True])
 def test_the_file_for_nerfstudio_follows_its_rules_whatever_the_input_was(tmp_path, model, several):
     refined = random_result(11, model=model, several=several)
@@ -95,6 +95,8 @@ def test_nerfstudio_refuses_what_it_would_misread(tmp_path):
     for refined in (
         random_result(1, model="FULL_OPENCV"),
         random_result(1, model="THIN_PRISM_FISHEYE"),
+        random_result(1, model="FOV"),
+        replace(mixed, cameras=(Camera("EUCM", 64, 48, (25.0, 25.0, 32.0, 24.0, 0.6, 1.1)),) * 2),
         replace(mixed, cameras=(mixed.cameras[0], fisheye)),
     ):
         with pytest.raises(InputError) as caught:

@@ -19,7 +19,7 @@ from biresnerf.data.formats.simple.trajectory import write_kitti, write_tum
 from biresnerf.data.formats.transforms.instant_ngp import write_transforms_ngp
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.errors import InputError
-from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS
+from biresnerf.geometry.camera.camera_models import FAMILY_MODELS, MODEL_PARAMETERS
 from biresnerf.options.formats import formats
 from biresnerf.options.refine_options import RefineOptions
 from tests.data.formats.random_sets import random_result
@@ -35,7 +35,7 @@ from tests.data.formats.readers import (
 )
 from tests.data.scenes import assert_complete
 
-NGP_MODELS = sorted(set(MODEL_PARAMETERS) - {"FULL_OPENCV", "THIN_PRISM_FISHEYE"})
+NGP_MODELS = sorted(set(FAMILY_MODELS) - {"FULL_OPENCV", "THIN_PRISM_FISHEYE"})
 CLOSE_PX = 0.01
 
 

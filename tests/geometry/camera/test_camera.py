@@ -23,6 +23,7 @@ from biresnerf.geometry.camera.camera import (
     project,
 )
 from biresnerf.geometry.camera.camera_models import (
+    FAMILY_MODELS,
     FISHEYE_MODELS,
     MODEL_IDS,
     MODEL_PARAMETERS,
@@ -84,14 +85,19 @@ def test_directions_projection_and_ids_agree_with_colmap(model, colmap):
     assert theirs["id"] == MODEL_IDS[model]
     intrinsics, index = one_camera(model, CAMERAS[model]), torch.zeros(200, dtype=torch.int64)
     directions = directions_in_cam(intrinsics, index, torch.from_numpy(pixels)).numpy()
-    np.testing.assert_allclose(directions[:, :2] / directions[:, 2:], theirs["rays"][:, :2], atol=1e-7)
+    carried = model not in FAMILY_MODELS
+    slopes = directions[:, :2] / directions[:, 2:]
+    np.testing.assert_allclose(slopes, theirs["rays"][:, :2], atol=1e-7, rtol=1e-6 if carried else 1e-7)
     ours = project(intrinsics, index, torch.from_numpy(points)).numpy()
-    np.testing.assert_allclose(ours, theirs["pixels"], atol=1e-8)
+    np.testing.assert_allclose(ours, theirs["pixels"], atol=1e-5 if carried else 1e-8)
 
 
 small = st.floats(-1.0, 1.0, allow_nan=False)
 # How large a coefficient is drawn: real lenses of the kind, and beyond, to where `lens_problem` refuses.
 SIZES = {"k1": 1.5, "k2": 1.5, "p1": 0.1, "p2": 0.1, "k3": 1.0, "k4": 1.5, "k5": 1.5, "k6": 1.0}
+SHAPES = {"omega": (0.3, 1.2), "k": (-0.4, 0.1), "alpha": (0.4, 0.7), "beta": (0.8, 1.2)}
+# What docs/conventions.md says of lenses that others carry, for photos of this size.
+CARRIED_PX = 1e-3
 FISHEYE_SIZES = {
     "k1": 0.2,
     "k2": 0.1,
@@ -116,9 +122,15 @@ def cameras(draw, models=tuple(MODEL_PARAMETERS)):
             params.append(focal * (draw(st.floats(0.8, 1.25)) if name == "fy" else 1.0))
         elif name in ("cx", "cy"):
             params.append((WIDTH if name == "cx" else HEIGHT) * (0.5 + 0.1 * draw(small)))
+        elif name in SHAPES:
+            params.append(draw(st.floats(*SHAPES[name])))
         else:
             params.append((FISHEYE_SIZES if fisheye else SIZES)[name] * draw(small))
-    assume(lens_problem(full_parameters(model, params), WIDTH, HEIGHT) is None)
+    try:
+        lens = Camera(model, WIDTH, HEIGHT, tuple(params)).full()
+    except ValueError:  # the corners show nothing
+        assume(False)
+    assume(lens_problem(lens, WIDTH, HEIGHT) is None)
     return model, tuple(params)
 
 
@@ -151,7 +163,8 @@ def test_colmap_projects_our_directions_to_their_pixels_within_a_millionth(colma
     directions = directions_in_cam(intrinsics, torch.zeros(64, dtype=torch.int64), torch.from_numpy(pixels))
     ahead = directions.numpy()[:, 2] > 0.05  # COLMAP's fisheyes end at 90 degrees
     theirs = colmap(*camera, pixels, directions.numpy())
-    assert np.abs(theirs["pixels"][ahead] - pixels[ahead]).max(initial=0.0) < 1e-6
+    most = 1e-6 if camera[0] in FAMILY_MODELS else CARRIED_PX
+    assert np.abs(theirs["pixels"][ahead] - pixels[ahead]).max(initial=0.0) < most
 
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.filter_too_much])

@@ -5,17 +5,20 @@ from __future__ import annotations
 import pytest
 
 from biresnerf.geometry.camera.camera_models import (
+    FAMILY_MODELS,
     MODEL_PARAMETERS,
+    Camera,
     FullParameters,
     full_parameters,
     smallest_model,
 )
-from tests.geometry.camera.lenses import CAMERAS
+from tests.geometry.camera.lenses import CAMERAS, HEIGHT, WIDTH
 
 
 @pytest.mark.parametrize("model", CAMERAS)
-def test_the_smallest_model_gives_the_parameters_back(model):
-    assert smallest_model(full_parameters(model, CAMERAS[model]), model) == (model, CAMERAS[model])
+def test_a_camera_with_its_own_lens_is_the_same(model):
+    camera = Camera(model, WIDTH, HEIGHT, CAMERAS[model])
+    assert camera.with_lens(camera.full()) == camera
 
 
 def test_a_model_that_cannot_hold_the_camera_is_left_for_one_that_can():
@@ -39,6 +42,6 @@ def test_a_model_that_cannot_hold_the_camera_is_left_for_one_that_can():
 def test_unknown_models_and_wrong_counts_are_refused():
     with pytest.raises(ValueError, match="OPENCV_FISHEYE"):
         full_parameters("EUCM", (1.0,) * 6)
-    for model, names in MODEL_PARAMETERS.items():
+    for model in FAMILY_MODELS:
         with pytest.raises(ValueError, match="parameters"):
-            full_parameters(model, (1.0,) * (len(names) + 1))
+            full_parameters(model, (1.0,) * (len(MODEL_PARAMETERS[model]) + 1))

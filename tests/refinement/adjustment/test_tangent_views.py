@@ -16,7 +16,9 @@ from tests.refinement.adjustment.rig import disturbed, observed, ring, rotation_
 CAMERAS = 8
 FISHEYE = Camera("OPENCV_FISHEYE", 800, 800, (250.0, 250.0, 402.0, 398.0, 0.02, -0.005, 0.001, 0.0))
 PINHOLE = Camera("PINHOLE", 400, 400, (500.0, 505.0, 201.0, 199.0))
+CARRIED = Camera("EUCM", 800, 800, (300.0, 300.0, 402.0, 398.0, 0.6, 1.1))
 ALL, SOME = [FISHEYE] * CAMERAS, [FISHEYE, PINHOLE] * (CAMERAS // 2)
+WITH_CARRIED = [CARRIED, PINHOLE] * (CAMERAS // 2)
 
 
 @pytest.fixture(name="rng")
@@ -33,7 +35,7 @@ def scene(rng, cameras, noise_px=0.0):
     return truth, Evidence(intrinsics, tracks.where((rays[:, 2] > np.cos(np.radians(115))).numpy()))
 
 
-@pytest.mark.parametrize("cameras", [ALL, SOME], ids=["all", "some"])
+@pytest.mark.parametrize("cameras", [ALL, SOME, WITH_CARRIED], ids=["all", "some", "carried"])
 def test_fisheyes_return_to_the_truth(rng, cameras):
     truth, evidence = scene(rng, cameras)
     start = disturbed(truth, rng, 0.02, 0.05)

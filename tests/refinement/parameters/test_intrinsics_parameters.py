@@ -14,7 +14,7 @@ from biresnerf.data.model.refined_set import refined_set
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.synthetic.scene import render_synthetic, synthetic_cameras, synthetic_focal
 from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam
-from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS, Camera
+from biresnerf.geometry.camera.camera_models import FAMILY_MODELS, MODEL_PARAMETERS, Camera
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.parameters.intrinsics_parameters import (
     COLUMNS,
@@ -43,6 +43,10 @@ CAMERAS = {
     "THIN_PRISM_FISHEYE": (40.0, 41.0, 31.0, 19.0, 0.02, -0.01, 0.001, -0.002, 0.003, -0.001, 0.002, 0.001),
     "SIMPLE_FISHEYE": (40.0, 30.0, 20.0),
     "FISHEYE": (40.0, 41.0, 31.0, 19.0),
+    "FOV": (40.0, 41.0, 31.0, 19.0, 0.9),
+    "SIMPLE_DIVISION": (40.0, 30.0, 20.0, -0.2),
+    "DIVISION": (30.0, 31.0, 31.0, 19.0, -0.2),
+    "EUCM": (30.0, 31.0, 31.0, 19.0, 0.6, 1.1),
     "OPENCV_FISHEYE": (40.0, 41.0, 31.0, 19.0, 0.02, -0.01, 0.003, -0.001),
 }
 
@@ -64,7 +68,7 @@ def fill(lenses: IntrinsicsParameters, size: float = 0.01) -> None:
         lenses.load_state({"increments": change * lenses.free})
 
 
-@pytest.mark.parametrize("model", CAMERAS)
+@pytest.mark.parametrize("model", FAMILY_MODELS)
 def test_the_working_intrinsics_are_those_of_the_written_camera(model):
     """What the optimiser casts rays with and what a file says afterwards are one camera, in the model as given."""
     lenses = parameters(lens(model))

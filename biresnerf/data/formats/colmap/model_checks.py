@@ -26,6 +26,7 @@ MAX_FEATURE_PX = 1e7
 # COLMAP writes unit quaternions with 15 digits, others with 6; a length beyond this is no rounding.
 QUAT_LENGTH_ERROR = 1e-2
 _HINT = "Export the model again with COLMAP, or copy it again: it may be cut off."
+_UNDISTORT = "Undistort the images with COLMAP's image_undistorter."
 
 
 def broken(where: str, what: str, code: str = "pose_file_invalid", hint: str = _HINT) -> InputError:
@@ -66,7 +67,7 @@ def model_name_of_id(model_id: int, where: str) -> str:
 def supported_model(name: str, where: str) -> str:
     """``name`` itself. Raises InputError ``camera_model_unsupported``."""
     if name not in MODEL_IDS:
-        hint = f"Supported are {', '.join(MODEL_IDS)}; undistort the images with COLMAP's image_undistorter."
+        hint = f"Supported are {', '.join(MODEL_IDS)}. {_UNDISTORT}"
         if name == PANORAMA:
             hint = (
                 "Give the panoramas alone, and their poses are found; or give the poses in a transforms.json with "
@@ -96,7 +97,10 @@ def camera_of_numbers(model: str, width: int, height: int, params: Sequence[floa
     if not np.isfinite(params).all():
         raise invalid("a parameter is no finite number")
     camera = Camera(model, int(width), int(height), tuple(float(value) for value in params))
-    full, side = camera.full(), max(width, height)
+    try:
+        full, side = camera.full(), max(width, height)
+    except ValueError as error:
+        raise broken(where, str(error), "camera_model_unsupported", _UNDISTORT) from None
     if not all(1e-3 * side < focal < 1e5 * side for focal in (full.fx, full.fy)):
         raise invalid(f"{full.fx:g}, {full.fy:g} px is no focal length")
     if not (-width < full.cx < 2 * width and -height < full.cy < 2 * height):

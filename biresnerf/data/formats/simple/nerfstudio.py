@@ -46,7 +46,8 @@ NERFSTUDIO = Format(
 _RADIAL = ("k1", "k2", "k3", "k4")
 _BROWN = (*_RADIAL, "p1", "p2")
 _BEYOND = ("k4", "k5", "k6")  # the rational model's, of which nerfstudio knows nothing
-_BEYOND_FISHEYE = ("p1", "p2", "sx1", "sy1")  # the thin prism's
+# The thin prism's, and of the carriers of other lenses.
+_BEYOND_FISHEYE = ("p1", "p2", "sx1", "sy1", "b1", "b2", "b3")
 
 
 def write_nerfstudio(refined: RefinedSet, path: Path, dataset: Dataset | None = None) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from biresnerf.data.formats.colmap.model_checks import camera_of_numbers
 from biresnerf.data.formats.parsed_poses import FrameCamera, panorama_lens
 from biresnerf.data.formats.transforms.write_intrinsics import FOCAL_KEYS
 from biresnerf.data.photos.guessed_lens import guess_lens, guess_note
@@ -19,8 +20,10 @@ from biresnerf.geometry.camera.camera_models import (
     PANORAMA,
     Camera,
     FullParameters,
+    of_shape,
     smallest_model,
 )
+from biresnerf.geometry.camera.carried_lenses import SHAPES
 from biresnerf.geometry.camera.lens import lens_problem
 
 _UNSUPPORTED = "camera_model_unsupported"
@@ -77,6 +80,29 @@ def camera_of_frame(fields: Fields, header: ImageHeader, name: str) -> FrameCame
     if not any(fields.get(key) is not None for key in FOCAL_KEYS):
         return _guessed(fields, header, preferred, fisheye, notes)
     full, more = _parameters(fields, preferred, fisheye, width, height)
+    if preferred in SHAPES:
+        camera = _of_own_formula(fields, preferred, full, width, height)
+    else:
+        camera = _of_a_family(fields, preferred, full, width, height)
+    shared = not any(fields.own(key) for key in ("fl_x", "fl_y", "camera_angle_x", "x_fov", "w", "h"))
+    return FrameCamera(camera.resized(header.width, header.height), "given", shared, (*notes, *more))
+
+
+def _of_own_formula(fields: Fields, model: str, full: FullParameters, width: int, height: int) -> Camera:
+    """The lens of a model with parameters of its own: omega; alpha and beta; or k."""
+    shape = [fields.get(key) for key in SHAPES[model]]
+    for key, value in zip(SHAPES[model], shape, strict=True):
+        if value is None:
+            raise fields.invalid(key, f"{model} needs {', '.join(SHAPES[model])}.", f"Add {key}.")
+    if full.distorted:
+        raise _unsupported(fields, "camera_model", f"{model} has no coefficients such as k1 or p1.")
+    model, params = of_shape(model, *full[:4], [value for value in shape if value is not None])
+    return camera_of_numbers(model, width, height, params, fields.where("camera_model"))
+
+
+def _of_a_family(
+    fields: Fields, preferred: str | None, full: FullParameters, width: int, height: int
+) -> Camera:
     # nerfstudio writes OPENCV with zeros for a pinhole; PINHOLE is the same camera and more programs read it.
     if preferred == "OPENCV" and not full.distorted:
         preferred = "PINHOLE"
@@ -85,9 +111,7 @@ def camera_of_frame(fields: Fields, header: ImageHeader, name: str) -> FrameCame
         hint = "Check the coefficients k1, k2, ... and p1, p2, or undistort the images."
         raise fields.invalid("k1", problem, hint)
     model, params = smallest_model(full, preferred)
-    camera = Camera(model, width, height, params).resized(header.width, header.height)
-    shared = not any(fields.own(key) for key in ("fl_x", "fl_y", "camera_angle_x", "x_fov", "w", "h"))
-    return FrameCamera(camera, "given", shared, (*notes, *more))
+    return Camera(model, width, height, params)
 
 
 def _guessed(

@@ -6,9 +6,10 @@ import math
 from typing import Any
 
 from biresnerf.geometry.camera.camera_models import COEFFICIENTS, MODEL_PARAMETERS, Camera, FullParameters
+from biresnerf.geometry.camera.carried_lenses import SHAPES
 
 FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
-_COLMAPS = ("FULL_OPENCV", "THIN_PRISM_FISHEYE")
+_COLMAPS = ("FULL_OPENCV", "THIN_PRISM_FISHEYE", *SHAPES)
 
 
 def family(camera: Camera) -> str:
@@ -23,6 +24,11 @@ def lens_values(camera: Camera) -> dict[str, Any]:
     values: dict[str, Any] = {"w": camera.width, "h": camera.height}
     if camera.panorama:
         return {"camera_model": camera.model, **values}
+    if camera.model in SHAPES:
+        named = dict(zip(MODEL_PARAMETERS[camera.model], camera.params, strict=True))
+        fx = named.get("f", named.get("fx"))
+        values |= {"fl_x": fx, "fl_y": named.get("fy", fx), "cx": named["cx"], "cy": named["cy"]}
+        return {**values, **{name: named[name] for name in SHAPES[camera.model]}}
     p = camera.full()
     values |= {"fl_x": p.fx, "fl_y": p.fy, "cx": p.cx, "cy": p.cy}
     names = ngp_coefficients(p) if camera.model not in _COLMAPS else MODEL_PARAMETERS[camera.model][4:]
@@ -48,16 +54,15 @@ def put_lens(place: dict[str, Any], camera: Camera) -> None:
     if camera.panorama:
         place |= lens_values(camera)
         return
-    p = camera.full()
+    p, values = camera.full(), lens_values(camera)
     angles = {
-        "camera_angle_x": 2 * math.atan(camera.width / (2 * p.fx)),
-        "camera_angle_y": 2 * math.atan(camera.height / (2 * p.fy)),
+        "camera_angle_x": 2 * math.atan(camera.width / (2 * values["fl_x"])),
+        "camera_angle_y": 2 * math.atan(camera.height / (2 * values["fl_y"])),
     }
     angles |= {
         "x_fov": math.degrees(angles["camera_angle_x"]),
         "y_fov": math.degrees(angles["camera_angle_y"]),
     }
-    values = lens_values(camera)
     plain = not p.distorted and p.fx == p.fy and (p.cx, p.cy) == (camera.width / 2, camera.height / 2)
     in_angles = plain and place.keys() & angles.keys() and not place.keys() & {"fl_x", "fl_y"}
     for key, angle in angles.items():

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.geometry.camera.camera_models import (
-    MODEL_PARAMETERS,
+    REFINED_PARAMETERS,
     Camera,
     FullParameters,
-    smallest_model,
 )
 from biresnerf.geometry.camera.distortion import coefficients_of, distort
 from biresnerf.geometry.camera.pixel_rays import rays_of_pixels
@@ -41,8 +38,7 @@ def corrected_camera(camera: Camera, correction: Array) -> Camera:
     )  # fmt: skip
     if correction[FOCAL + 1 :].any():
         lens = _fitted(lens, camera, correction)
-    model, params = smallest_model(lens, camera.model)
-    return replace(camera, model=model, params=params)
+    return camera.with_lens(lens)
 
 
 def _fitted(lens: FullParameters, camera: Camera, correction: Array) -> FullParameters:
@@ -52,7 +48,7 @@ def _fitted(lens: FullParameters, camera: Camera, correction: Array) -> FullPara
     """
     old, slopes = camera.full(), _grid(camera)
     moved = dict(zip(FITTED, correction[DISTORTION].tolist(), strict=True))
-    names = [name for name in FITTED if name in MODEL_PARAMETERS[camera.model] or moved[name]]
+    names = [name for name in FITTED if name in REFINED_PARAMETERS[camera.model] or moved[name]]
     aspect = float(np.exp(correction[ASPECT]))
     bent = _bent(slopes, FullParameters(1.0, 1.0, 0.0, 0.0, **moved)) * [1.0, aspect]
     shown = _bent(bent * np.exp(correction[FOCAL]) + correction[CENTRE], old)

@@ -156,7 +156,7 @@ TEXT_FAULTS = {
     "word for a number": ("cameras.txt", "18.5", "wide", "pose_file_invalid"),
     "too few parameters": ("cameras.txt", " 7.75", "", "intrinsics_invalid"),
     "too many parameters": ("cameras.txt", "7.75", "7.75 0", "intrinsics_invalid"),
-    "unknown model": ("cameras.txt", "PINHOLE", "EUCM", "camera_model_unsupported"),
+    "unknown model": ("cameras.txt", "PINHOLE", "CYLINDER", "camera_model_unsupported"),
     "negative width": ("cameras.txt", " 20 ", " -20 ", "pose_file_invalid"),
     "camera id that binary tables cannot hold": ("cameras.txt", "7 P", "4294967296 P", "pose_file_invalid"),
     "image id that binary tables cannot hold": (

@@ -13,7 +13,11 @@ from scipy.spatial.transform import Rotation
 from biresnerf.data.formats.photogrammetry.opensfm import write_opensfm
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.errors import InputError
-from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS, FullParameters, smallest_model
+from biresnerf.geometry.camera.camera_models import (
+    FAMILY_MODELS,
+    FullParameters,
+    smallest_model,
+)
 from tests.data.formats.photogrammetry.test_write_photogrammetry import made
 from tests.data.formats.posed_sets import assert_reads_as, write_photos, write_plain_photos
 from tests.data.scenes import assert_complete
@@ -28,7 +32,7 @@ def rewrite(path, change):
     path.write_text(json.dumps(document))
 
 
-@pytest.mark.parametrize("model", sorted(MODEL_PARAMETERS))
+@pytest.mark.parametrize("model", sorted(FAMILY_MODELS))
 @pytest.mark.parametrize("several", [False, True])
 def test_what_is_written_comes_back(tmp_path, model, several):
     refined = made(model, several=several, square=False)

@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 from biresnerf.data.formats.photogrammetry.realitycapture import COLUMNS, write_realitycapture
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.errors import InputError
-from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS
+from biresnerf.geometry.camera.camera_models import FAMILY_MODELS
 from tests.data.formats.photogrammetry.test_write_photogrammetry import made
 from tests.data.formats.posed_sets import assert_reads_as, write_photos
 from tests.data.scenes import assert_complete, write_image
 
-MODELS = sorted(name for name in MODEL_PARAMETERS if "FISHEYE" not in name)
+MODELS = sorted(name for name in FAMILY_MODELS if "FISHEYE" not in name)
 
 
 @pytest.mark.parametrize("model", MODELS)

@@ -13,7 +13,7 @@ from biresnerf.data.formats.photogrammetry.meshroom import write_meshroom
 from biresnerf.data.formats.photogrammetry.openmvg import write_openmvg
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.errors import InputError
-from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS
+from biresnerf.geometry.camera.camera_models import FAMILY_MODELS, MODEL_PARAMETERS
 from tests.data.formats.photogrammetry.test_write_photogrammetry import made
 from tests.data.formats.posed_sets import assert_reads_as, write_photos, write_plain_photos
 from tests.data.scenes import assert_complete
@@ -34,7 +34,7 @@ def written(folder, form, refined, change=lambda document: None):
     return folder / name
 
 
-@pytest.mark.parametrize("model", sorted(MODEL_PARAMETERS))
+@pytest.mark.parametrize("model", sorted(FAMILY_MODELS))
 @pytest.mark.parametrize("several", [False, True])
 @pytest.mark.parametrize("form", FORMS)
 def test_what_is_written_comes_back(tmp_path, form, model, several):

@@ -16,7 +16,7 @@ from biresnerf.data.formats.photogrammetry.openmvg import write_openmvg
 from biresnerf.data.formats.photogrammetry.opensfm import write_opensfm
 from biresnerf.data.formats.photogrammetry.realitycapture import write_realitycapture
 from biresnerf.errors import InputError
-from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS
+from biresnerf.geometry.camera.camera_models import FAMILY_MODELS, MODEL_PARAMETERS, Camera
 from tests.data.formats.random_sets import random_result
 from tests.data.formats.readers import ours, seen_points
 from tests.data.scenes import assert_complete
@@ -137,7 +137,7 @@ FORMS = {
 
 
 @pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("model", sorted(MODEL_PARAMETERS))
+@pytest.mark.parametrize("model", sorted(FAMILY_MODELS))
 @pytest.mark.parametrize("several", [False, True])
 def test_points_appear_where_they_do_for_us(tmp_path, form, model, several):
     refined = made(model, several=several)
@@ -159,7 +159,11 @@ def test_points_appear_where_they_do_for_us(tmp_path, form, model, several):
 def test_lenses_that_a_program_does_not_have_are_refused(tmp_path, form):
     write, _ = FORMS[form]
     rational, oblong = random_result(21, model="FULL_OPENCV"), random_result(21, model="OPENCV")
-    for refined in [rational] if form == "opensfm" else [rational, oblong]:
+    carried = random_result(21, model="FOV")
+    wide = replace(carried, cameras=(Camera("EUCM", 64, 48, (25.0, 25.0, 32.0, 24.0, 0.6, 1.1)),))
+    assert wide.cameras[0].full().fisheye
+    assert not carried.cameras[0].full().fisheye
+    for refined in [rational, carried, wide] + ([] if form == "opensfm" else [oblong]):
         with pytest.raises(InputError) as caught:
             write(refined, tmp_path / "file")
         assert_complete(caught.value, "export_not_possible", "file")

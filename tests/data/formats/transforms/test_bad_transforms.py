@@ -114,9 +114,9 @@ BAD = {
     "another fisheye": (
         "camera_model_unsupported",
         "camera_model",
-        lambda d: d.update(camera_model="EUCM"),
+        lambda d: d.update(camera_model="CYLINDER"),
     ),
-    "own fisheye": ("camera_model_unsupported", "frames[2].camera_model", _frame(2, camera_model="FOV")),
+    "own fisheye": ("camera_model_unsupported", "frames[2].camera_model", _frame(2, camera_model="CYLINDER")),
     "odd model": ("camera_model_unsupported", "camera_model", lambda d: d.update(camera_model=["OPENCV"])),
     "two lenses": ("camera_model_unsupported", "is_fisheye", lambda d: d.update(is_fisheye=True)),
     "fisheye perhaps": ("camera_model_unsupported", "is_fisheye", lambda d: d.update(is_fisheye="no")),
