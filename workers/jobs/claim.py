@@ -76,7 +76,7 @@ async def _claim(
         if row["cancel_requested"]:
             await finish_cancelled(connection, job_id, stall_s)
             return None
-        if used_up(row["attempt"], row["crashes"], max_attempts):
+        if used_up(row["attempt"], row["crashes"], row["losses"], max_attempts):
             await finish(connection, job_id, "failed", crashed_too_often(row["attempt"], row["setback"]))
             await trash_attempts(connection, job_id, stall_s)
             return None

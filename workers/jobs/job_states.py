@@ -98,14 +98,16 @@ async def requeue(connection: Connection, job_id: str, how: Requeue) -> None:
     A setback counts only where an attempt was running: not before one began, nor after it gave the job back itself.
     """
     setback = None if how.setback is None else SETBACKS[how.setback]
+    counts = setback and setback.counts
     await connection.execute(
         "UPDATE jobs SET state = 'queued', attempt = attempt - %s,"
         " crashes = crashes + CASE WHEN state = 'running' THEN %s ELSE 0 END,"
+        " losses = losses + CASE WHEN state = 'running' THEN %s ELSE 0 END,"
         " setback = CASE WHEN state = 'running' THEN %s ELSE setback END,"
         " message = %s, eta_s = NULL, run_token = CASE WHEN %s THEN NULL ELSE run_token END,"
         " checkpoint = CASE WHEN %s THEN NULL ELSE checkpoint END, smaller = smaller || %s WHERE id = %s",
         (
-            *(int(setback is None), int(setback is not None and setback.counts), how.setback),
+            *(int(setback is None), int(counts == "crash"), int(counts == "loss"), how.setback),
             *(setback.message if setback else "", how.fence, how.forget_checkpoint),
             *(Jsonb(dict(how.smaller)), job_id),
         ),

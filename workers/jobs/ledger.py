@@ -111,7 +111,7 @@ class Ledger:
             return  # an earlier try got through, though its acknowledgement was lost
         await _discard_replaced(connection, job["checkpoint"], prefix)
         await _set(connection, job, "checkpoint", {"prefix": prefix, "files": list(files)})
-        await connection.execute("UPDATE jobs SET crashes = 0 WHERE id = %s", (job["id"],))
+        await connection.execute("UPDATE jobs SET crashes = 0, losses = 0 WHERE id = %s", (job["id"],))
         await _add_event(connection, job, "checkpoint", {"step": step})
 
     @_fenced(_nothing)

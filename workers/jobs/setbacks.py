@@ -9,6 +9,8 @@ from typing import Literal
 from biresnerf.wire.problems import JobError
 
 Cause = Literal["worker_lost", "killed", "error", "disk_full", "store_away"]
+# Workers that a job may lose one after the other, likewise: most are stopped or frozen, some did the job take down.
+LOSSES_PER_CRASH = 3
 # Attempts of a job at most, in crashes that it may have one after the other: each of them may store a checkpoint first.
 ATTEMPTS_PER_CRASH = 10
 
@@ -18,13 +20,13 @@ class Setback:
     """One way for an attempt to end too early.
 
     Attributes:
-        counts: whether it is a crash, of which a job may have so many without a new checkpoint between them.
+        counts: as what, of which a job may have so many without a new checkpoint between them.
         what: what happened, after "The last time ".
         hint: what to do where it happened too often.
         message: what the job's owner reads while the job waits.
     """
 
-    counts: bool
+    counts: Literal["crash", "loss"] | None
     what: str
     hint: str
     message: str = ""
@@ -32,28 +34,28 @@ class Setback:
 
 SETBACKS: Mapping[Cause, Setback] = {
     "worker_lost": Setback(
-        True,
+        "loss",
         "the worker was lost: it was killed, or its machine stopped",
         "Submit the job again; tell the operator if that does not help.",
     ),
     "killed": Setback(
-        True,
+        "crash",
         "its process was killed, mostly for want of memory",
         "Try smaller options (preset fast, a smaller max_image_size) or a machine with more memory.",
     ),
     "error": Setback(
-        True,
+        "crash",
         "the program failed",
         "This is a fault of the program. Tell the operator the job's id: the worker's log has the details.",
     ),
     "disk_full": Setback(
-        False,
+        None,
         "the worker's disk was full",
         "Ask the operator for more room, or try a smaller max_image_size.",
         "Waiting: the worker's disk is full.",
     ),
     "store_away": Setback(
-        False,
+        None,
         "the file storage did not answer",
         "Tell the operator, and submit the job again later.",
         "Waiting: the file storage does not answer.",
@@ -61,9 +63,16 @@ SETBACKS: Mapping[Cause, Setback] = {
 }
 
 
-def used_up(attempts: int, crashes: int, max_attempts: int) -> bool:
-    """Whether a job may not be tried again, after so many attempts and crashes since its last checkpoint."""
-    return crashes >= max_attempts or attempts >= ATTEMPTS_PER_CRASH * max_attempts
+def used_up(attempts: int, crashes: int, losses: int, max_attempts: int) -> bool:
+    """Whether a job may not be tried again.
+
+    After so many attempts, and so many crashes and lost workers since its last checkpoint.
+    """
+    return (
+        crashes >= max_attempts
+        or losses >= LOSSES_PER_CRASH * max_attempts
+        or attempts >= ATTEMPTS_PER_CRASH * max_attempts
+    )
 
 
 def crashed_too_often(attempts: int, cause: Cause | None, log_tail: str = "") -> JobError:

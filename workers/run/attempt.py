@@ -236,7 +236,7 @@ class Attempt:
 
     async def _may_try_again(self) -> bool:
         crashes = await self._ledger.crashes() + 1
-        return not used_up(self._claim.attempt, crashes, self._settings.max_attempts)
+        return not used_up(self._claim.attempt, crashes, 0, self._settings.max_attempts)
 
     def _log_crash(self) -> None:
         """What the process says for the operator alone."""

@@ -105,7 +105,10 @@ class Settings(BaseSettings):
     job_timeout_s: float = Field(2 * 3600, gt=0, description="Longest run of one attempt.")
     check_timeout_s: float = Field(900, gt=0, description="Longest validation of one dataset.")
     max_attempts: int = Field(
-        3, ge=1, description="Crashes after which a job fails, if it stores no checkpoint between them."
+        3,
+        ge=1,
+        description="Crashes after which a job fails, if it stores no checkpoint between them."
+        " It may lose three times as many workers.",
     )
     job_nice: int = Field(
         10,

@@ -14,6 +14,7 @@ import pytest
 from benchmarks.chaos.surroundings import WrongClock
 from tests.workers.conftest import SHORT_STALL, Counting, Slots, died
 from workers.engine import Stores
+from workers.jobs.setbacks import LOSSES_PER_CRASH
 from workers.settings.settings import Settings
 
 pytestmark = pytest.mark.anyio
@@ -160,14 +161,16 @@ async def test_a_job_that_kills_its_worker_each_time_fails_too(
     counting: Counting, settings: Settings, slots: Slots
 ):
     once = settings.model_copy(update={"max_attempts": 1})
-    first = slots.start(once, "a")
-    await counting.submit(100, 0.05)
-    await counting.until(lambda job: job.state == "running")
-    first.kill()
-    first.wait()
+    await counting.submit(100, 0.05, checkpoint_every=1000)
+    for attempt in range(1, LOSSES_PER_CRASH + 1):
+        slot = slots.start(once, "a")
+        await counting.until(lambda job, n=attempt: job.state == "running" and job.attempt == n)
+        slot.kill()
+        slot.wait()
     slots.start(once, "a")
     job = await counting.until_final()
     assert job.error is not None
+    assert job.attempt == LOSSES_PER_CRASH, "losing a worker is seldom the job's fault"
     assert (job.state, job.error.code) == ("failed", "too_many_crashes")
     assert "the worker was lost" in job.error.detail
 

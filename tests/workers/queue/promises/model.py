@@ -12,8 +12,8 @@ from typing import Literal
 
 Place = Literal["todo", "later", "doing", "over"]
 FENCED = "fenced"
-COUNTED = {"worker_lost", "killed", "error"}
-MAX_CRASHES, MAX_ATTEMPTS = 3, 30
+COUNTED = {"killed", "error"}
+MAX_CRASHES, MAX_LOSSES, MAX_ATTEMPTS = 3, 9, 30
 ENDS = {"succeeded", "failed", "cancelled"}
 
 
@@ -24,6 +24,7 @@ class Job:
     state: str = "queued"
     attempt: int = 0
     crashes: int = 0
+    losses: int = 0
     setback: str | None = None
     token: uuid.UUID | None = None
     cancel_requested: bool = False
@@ -133,7 +134,7 @@ def claimed(name: str, worker: int, token: uuid.UUID | None) -> Change:
             return False, world
         if job.cancel_requested:
             return False, world.with_job(name, job.ended("cancelled"))
-        if job.crashes >= MAX_CRASHES or job.attempt >= MAX_ATTEMPTS:
+        if job.crashes >= MAX_CRASHES or job.losses >= MAX_LOSSES or job.attempt >= MAX_ATTEMPTS:
             return False, world.with_job(name, job.ended("failed"))
         running = replace(job, state="running", attempt=job.attempt + 1, token=token, stage=None)
         return True, world.with_job(name, running.with_event("started"))
@@ -172,7 +173,7 @@ def progressed(name: str, token: uuid.UUID, stage: str) -> Change:
 def checkpointed(name: str, token: uuid.UUID, prefix: str) -> Change:
     def effect(job: Job) -> tuple[object, Job]:
         replaced = job.trash | ({job.checkpoint} if job.checkpoint not in (None, prefix) else set())
-        return None, job.with_event("checkpoint", checkpoint=prefix, crashes=0, trash=replaced)
+        return None, job.with_event("checkpoint", checkpoint=prefix, crashes=0, losses=0, trash=replaced)
 
     return _owned(name, token, effect)
 
@@ -248,7 +249,7 @@ def released(world: World) -> Outcome:
             job = replace(job, place="over", worker=None, abort=False, token=None).ended("cancelled")
         else:
             if job.state == "running":
-                job = replace(job, state="queued", setback="worker_lost", crashes=job.crashes + 1)
+                job = replace(job, state="queued", setback="worker_lost", losses=job.losses + 1)
             job = job.with_event("requeued", place="todo", worker=None, token=None)
         world = world.with_job(name, job)
     return None, replace(world, silent=frozenset())

@@ -42,7 +42,7 @@ def _job(row: Mapping[str, Any]) -> Job:
     elif row["entry"] == "todo":
         place = "later" if row["waits"] else "todo"
     root = f"jobs/{row['id']}/"
-    same = ("state", "attempt", "crashes", "setback", "cancel_requested", "stage", "held")
+    same = ("state", "attempt", "crashes", "losses", "setback", "cancel_requested", "stage", "held")
     return Job(
         **{name: row[name] for name in same},
         token=row["run_token"],
