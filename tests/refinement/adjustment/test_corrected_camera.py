@@ -92,3 +92,16 @@ def test_a_model_that_lacks_a_term_grows_to_the_smallest_that_has_it(model, chan
     camera, moved = Camera(model, 400, 300, tuple(values)), correction(focal=0.01, **change)
     assert corrected_camera(camera, moved).model == grown
     assert largest_difference_px(camera, moved) < 1e-8
+
+
+@pytest.mark.parametrize(
+    ("model", "shape"),
+    [("FOV", (0.9,)), ("DIVISION", (-0.2,)), ("EUCM", (0.6, 1.1))],
+    ids=["FOV", "DIVISION", "EUCM"],
+)
+def test_a_lens_of_another_formula_is_corrected_and_stays_one(model, shape):
+    """Its formula holds any change of the focal length, and nearly any small one of the shape."""
+    camera = Camera(model, 400, 300, (300.0, 306.0, 201.0, 149.0, *shape))
+    for change, px in ((correction(focal=0.05), 1e-4), (correction(focal=0.02, k1=0.01), 0.2)):
+        assert corrected_camera(camera, change).model == model
+        assert largest_difference_px(camera, change) < px
