@@ -113,6 +113,10 @@ def _refuse_ambiguous(request: Request) -> None:
     if len(request.headers.getlist("authorization")) > 1:
         detail = "Authorization is given twice."
         raise ProblemError("malformed_request", detail, where="Authorization", headers=close)
+    packed = request.headers.get("content-encoding", "identity")
+    if packed.strip().lower() != "identity":
+        detail = f"The body is sent packed ({packed[:40]!r}), which is not read."
+        raise ProblemError("unsupported_media", detail, where="Content-Encoding", headers=close)
     # The parser limits only headers that arrive in pieces; those that arrive at once are measured here.
     head = [request.scope["raw_path"], request.scope["query_string"], *sum(request.scope["headers"], ())]
     if sum(map(len, head)) > HEAD_BYTES_MAX:

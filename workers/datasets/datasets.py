@@ -286,6 +286,20 @@ class DatasetStore(OwnedStore):
             row = await connection.required_row(missing, sql, dataset_id, path, self._tenant)
         return DatasetFile.model_validate(row)
 
+    async def delete_file(self, dataset_id: str, path: str) -> None:
+        """Take a file out of an open dataset; raises `NotFound`, `Conflict` (``dataset_not_open``)."""
+        async with self._database.transaction() as connection:
+            await require_open(connection, dataset_id, self._tenant)
+            row = await connection.required_row(
+                f"Dataset {dataset_id} has no file {path}.",
+                "DELETE FROM dataset_files WHERE dataset_id = %s AND path = %s RETURNING key",
+                *(dataset_id, path),
+            )
+            await discard(connection, row["key"].removesuffix(f"/{path}"))
+            await connection.execute(
+                "UPDATE datasets SET revision = revision + 1 WHERE id = %s", (dataset_id,)
+            )
+
     async def files(
         self, dataset_id: str, *, limit: int = 1000, cursor: str | None = None
     ) -> Page[DatasetFile]:

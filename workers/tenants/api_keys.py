@@ -55,6 +55,7 @@ class KeyStore:
 
     def __init__(self, database: Database) -> None:
         self._database = database
+        self._any_made = False
 
     async def create(
         self, tenant: str, name: str, scopes: Iterable[Scope], *, lives: timedelta | None = None
@@ -106,8 +107,10 @@ class KeyStore:
 
     async def any_made(self) -> bool:
         """Whether a key was ever made. A revoked one counts: revoking the last must not open the doors."""
-        rows = await self._database.fetch("SELECT EXISTS (SELECT 1 FROM api_keys) AS any")
-        return bool(rows[0]["any"])
+        if not self._any_made:  # each request without a key asks
+            rows = await self._database.fetch("SELECT EXISTS (SELECT 1 FROM api_keys) AS any")
+            self._any_made = bool(rows[0]["any"])
+        return self._any_made
 
     async def list(self, tenant: str | None = None) -> tuple[ApiKey, ...]:
         """The keys of a tenant, or all; oldest first."""

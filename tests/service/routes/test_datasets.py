@@ -281,3 +281,25 @@ def test_datasets_and_files_are_listed_page_by_page(http: httpx.Client, scene: P
     assert http.get("/v1/datasets?limit=1").json()["items"][0]["id"] == dataset
     problem(http.get("/v1/datasets?cursor=nonsense"), 400, "bad_cursor")
     problem(http.get("/v1/datasets?limit=0"), 422, "invalid_request")
+
+
+def test_a_file_of_an_open_dataset_can_be_deleted_and_the_dataset_closed(http: httpx.Client) -> None:
+    dataset = new_dataset(http)
+    files = f"/v1/datasets/{dataset}/files"
+    for path in ("a.png", "A.png"):
+        assert http.put(f"{files}/{path}", content=b"x").status_code == 201
+    problem(http.post(f"/v1/datasets/{dataset}/finalize"), 422, "name_collision")
+    assert http.delete(f"{files}/A.png").status_code == 204
+    problem(http.delete(f"{files}/A.png"), 404, "not_found")
+    assert [file["path"] for file in http.get(files).json()["items"]] == ["a.png"]
+    assert http.get(f"/v1/datasets/{dataset}").json()["bytes"] == 1
+    http.post(f"/v1/datasets/{dataset}/finalize")
+    problem(http.delete(f"{files}/a.png"), 409, "dataset_not_open")
+
+
+def test_a_packed_body_is_refused_and_not_stored_as_it_is(http: httpx.Client) -> None:
+    dataset, packed = new_dataset(http), {"Content-Encoding": "gzip"}
+    sent = http.put(f"/v1/datasets/{dataset}/files/a.png", content=b"x", headers=packed)
+    assert problem(sent, 415, "unsupported_media")["where"] == "Content-Encoding"
+    problem(http.post("/v1/datasets", json={}, headers=packed), 415, "unsupported_media")
+    assert http.get(f"/v1/datasets/{dataset}").json()["files"] == 0
