@@ -107,9 +107,10 @@ def decide(findings: Findings) -> Verdict:
     name, ground = _judge(findings)
     # Where nothing speaks for either, poses that somebody gave stay, as do found ones while the evidence is weak. Mere
     # guesses do not, nor found ones that measure the same: left-out tracks and patches chose the refined ones. Nor do
-    # found ones that heed no measured places, where nothing speaks against refined ones that do.
+    # found ones where left-out matches fit the refined ones better, or where these alone heed measured places, and
+    # nothing speaks against them.
     yields = _measures_the_same(findings) if name == "unchanged" else not findings.grounded
-    yields = yields or _alone_heed_places(findings)
+    yields = yields or _alone_heed_places(findings) or _fit_matches_alone(findings)
     keep = name != "improved" and not (name in ("unchanged", "inconclusive") and yields)
     return Verdict(
         verdict=name,
@@ -184,6 +185,12 @@ def _alone_heed_places(f: Findings) -> bool:
     """Whether refined poses were adjusted to measured places, the others come from matches, and all speaks for both."""
     heeded = f.favoured_by_positions is not None and not _against(f)
     return heeded and f.compared_with == "seeded" and f.moved_px >= MEASURABLE_PX and not f.faults
+
+
+def _fit_matches_alone(f: Findings) -> bool:
+    """Whether left-out matches fit found poses worse than refined ones, and nothing speaks against these."""
+    doubted = _against(f) or f.faults or (f.epipolar is not None and f.epipolar.share_of_image > FITS_BELOW)
+    return f.compared_with == "seeded" and _matches_are_better(f) and not doubted
 
 
 def _counted(f: Findings) -> list[PairedDifference]:

@@ -164,6 +164,21 @@ def test_found_poses_yield_to_refined_ones_that_heed_measured_places():
         assert decide(replace(heeding, **doubt)).returned == "input"
 
 
+def test_found_poses_yield_to_refined_ones_that_left_out_matches_fit_better():
+    unexplained = findings(held_out(0.05), matched(0.3), moved_px=200.0, compared_with="seeded")
+    said = decide(unexplained)
+    assert (said.verdict, said.returned) == ("inconclusive", "refined")
+    off = matched(0.3, share=0.5)
+    doubts = (
+        {"compared_with": "given"},
+        {"faults": ("a fault",)},
+        {"heldout": held_out(-4.0)},
+        {"epipolar": off},
+    )
+    for doubt in doubts:
+        assert decide(replace(unexplained, **doubt)).returned == "input"
+
+
 def test_measured_poses_are_called_what_they_are():
     told = decide(findings(held_out(0.05), compared_with="seeded", by_gimbal=True))
     assert told.returned == "input"
