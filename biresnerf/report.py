@@ -57,7 +57,8 @@ class HeldOutEvidence(FrozenModel):
         None,
         examples=[1.3],
         description="By how many px, at working size, the photos would have to be shifted to differ from themselves as "
-        "much as from their renders with the refined poses: the median of the views. None in older reports.",
+        "much as from their renders with the poses that fit them better: the median of the views. None in older "
+        "reports.",
     )
 
 

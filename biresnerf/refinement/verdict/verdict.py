@@ -218,7 +218,7 @@ def _views_are_better(f: Findings) -> bool:
 
 
 def _views_tell(f: Findings) -> bool:
-    """Whether unseen views may speak alone: poses that explain each other fit photos better, and miss them by far."""
+    """Whether unseen views may speak alone, or against matches: poses that fit photos better may miss them by far."""
     missed = f.heldout.missed_px if f.heldout is not None else None
     return missed is None or photos_tell(missed, f.moved_px)
 
@@ -230,7 +230,8 @@ def _matches_are_better(f: Findings) -> bool:
 def _against(f: Findings) -> list[str]:
     """What speaks against them; matches that the start came from may do so as well."""
     names = []
-    if f.heldout is not None and "worse" in (f.heldout.psnr.finding, f.heldout.ssim.finding):
+    worse = f.heldout is not None and "worse" in (f.heldout.psnr.finding, f.heldout.ssim.finding)
+    if worse and (_views_tell(f) or f.favoured_by_matches <= 0):
         names.append(VIEWS)
     if f.favoured_by_matches < 0:
         names.append(MATCHES)

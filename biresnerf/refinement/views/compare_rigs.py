@@ -136,8 +136,9 @@ def compare_on_unseen_views(
             scores = tuple(trial.scores() for trial in running)
             old, new = (joined(side) for side in zip(*earlier, scores, strict=True))
             strictly = len(set(seen) & set(held_out))
+            nearer = new if new.psnr.mean() >= old.psnr.mean() else old
             evidence = _evidence(
-                old, new, running[0].optimiser.step_index, strictly, _missed_px(new, images, seen)
+                old, new, running[0].optimiser.step_index, strictly, _missed_px(nearer, images, seen)
             )
             decided = _decided(evidence, EARLY if look < 1 else 1, effort)
             if pictured and (decided or look == 1):
@@ -168,7 +169,7 @@ def _missed_px(scores: TrialScores, images: ImageSet, views: Sequence[int]) -> f
 
 
 def photos_tell(missed_px: float, moved_px: float) -> bool:
-    """Whether renders with the refined poses are near enough to the photos to tell poses that differ by a motion."""
+    """Whether renders with the better poses are near enough to the photos to tell others that differ by a motion."""
     return missed_px <= max(BLUR_PX, NEARER * moved_px)
 
 
@@ -187,16 +188,11 @@ def _decided(evidence: HeldOutEvidence, times: float, effort: Effort) -> bool:
 
     Other views, or more steps, would hardly change that. They may where a gain is not enough to tell yet.
     """
-    missed = evidence.missed_px
+    told = evidence.missed_px is None or photos_tell(evidence.missed_px, effort.moved_px)
     both = ((evidence.psnr, PSNR_MATTERS), (evidence.ssim, SSIM_MATTERS))
     for side in (1, -1):
         nearest = [found.low if side > 0 else found.high for found, _ in both]
-        if (
-            side > 0
-            and effort.favoured <= 0
-            and missed is not None
-            and not photos_tell(missed, effort.moved_px)
-        ):
+        if not told and side != effort.favoured:
             continue
         beyond = 0 if side == effort.favoured else times
         if all(

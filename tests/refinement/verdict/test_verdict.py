@@ -164,6 +164,15 @@ def test_found_poses_yield_to_refined_ones_that_heed_measured_places():
         assert decide(replace(heeding, **doubt)).returned == "input"
 
 
+def test_views_that_miss_the_photos_by_far_do_not_overrule_matches():
+    # An object that was turned before a still room: wrong poses that explain the room fit photos better, and none well.
+    far, near = (findings(held_out(-2.3, missed_px=px), matched(7.9), moved_px=10.9) for px in (16.0, 5.0))
+    assert [decide(each).verdict for each in (far, near)] == ["improved", "inconclusive"]
+    alone = replace(far, epipolar=None)
+    disagreeing = replace(far, epipolar=matched(-1.0))
+    assert [decide(each).verdict for each in (alone, disagreeing)] == ["kept_input", "kept_input"]
+
+
 def test_found_poses_yield_to_refined_ones_that_left_out_matches_fit_better():
     unexplained = findings(held_out(0.05), matched(0.3), moved_px=200.0, compared_with="seeded")
     said = decide(unexplained)
