@@ -110,7 +110,7 @@ def test_the_yardstick_in_cpp_computes_what_the_definition_does(grid):
 @pytest.mark.parametrize("form", [UnrolledField, VectorisedField])
 @pytest.mark.parametrize("stage", ["coarse", "fine"])
 def test_a_step_of_the_torch_forms_computes_what_the_definitions_step_does(form, stage):
-    ours = scene.optimiser(stage, images=4, threads=1, rays=64, size=32, preset="fast")
+    ours = scene.untrained(images=4, threads=1, size=32, preset="fast")
     gradients = []
     for kind in (form, ReferenceField):
         field = kind(ours.field.shape, 0, scene.CPU)
