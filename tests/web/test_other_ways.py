@@ -213,9 +213,11 @@ def test_a_long_list_is_shown_piece_by_piece_and_all_of_it_is_live(
     assert names(page) == ["kitchen", *newest[:23]]
     page.get_by_role("button", name="More jobs").click()
     expect(page.locator(".job-card")).to_have_count(48)
+    shown = 48
     while (more := page.get_by_role("button", name="More jobs")).is_visible():
         more.click()
-        page.wait_for_timeout(100)
+        expect(page.locator(".job-card")).not_to_have_count(shown)  # the button goes with the last piece
+        shown = page.locator(".job-card").count()
     assert names(page)[: WAITING + 1] == ["kitchen", *newest]
     words = page.locator(".job-card", has_text="kitchen").locator(".run-words")
     expect(words).to_contain_text("look")
