@@ -133,7 +133,9 @@ async def put_file(
     return file if new else Response(status_code=204)
 
 
-@router.delete("/{dataset_id}/files/{path:path}", status_code=204, responses=declared("dataset_not_open"))
+@router.delete(
+    "/{dataset_id}/files/{path:path}", status_code=204, responses=declared("dataset_not_open", "unsafe_path")
+)
 async def delete_file(dataset_id: DatasetId, path: str, caller: DatasetWriter) -> None:
     """Takes a file out of an open dataset."""
     await caller.datasets.delete_file(dataset_id, checked_path(path))
