@@ -29,9 +29,8 @@ def joined_to(dataset: Dataset, options: RefineOptions, result: Path) -> tuple[D
     pose_of = dict(zip(earlier.names, earlier.poses, strict=True))
     lens_of = dict(zip(earlier.names, earlier.intrinsics, strict=True))
     if any(name.startswith(f"{PANORAMA_VIEWS}/") for name in earlier.names):
-        pose_of = read_poses(
-            result / TRANSFORMS.in_result
-        )  # has one for each panorama; its views have the others
+        # It has one pose for each panorama; the others are of its views.
+        pose_of = read_poses(result / TRANSFORMS.in_result)
     found = {name: known for known, name in match_files(list(pose_of), dataset.names)[0].items()}
     if not found:
         raise InputError(

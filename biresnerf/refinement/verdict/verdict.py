@@ -110,7 +110,7 @@ def decide(findings: Findings) -> Verdict:
     # found ones where left-out matches fit the refined ones better, or where these alone heed measured places, and
     # nothing speaks against them.
     yields = _measures_the_same(findings) if name == "unchanged" else not findings.grounded
-    yields = yields or _alone_heed_places(findings) or _fit_matches_alone(findings)
+    yields = yields or _found_poses_yield(findings)
     keep = name != "improved" and not (name in ("unchanged", "inconclusive") and yields)
     return Verdict(
         verdict=name,
@@ -181,16 +181,16 @@ def _measures_the_same(f: Findings) -> bool:
     return f.compared_with == "seeded" and f.moved_px >= MEASURABLE_PX and both
 
 
-def _alone_heed_places(f: Findings) -> bool:
-    """Whether refined poses were adjusted to measured places, the others come from matches, and all speaks for both."""
-    heeded = f.favoured_by_positions is not None and not _against(f)
-    return heeded and f.compared_with == "seeded" and f.moved_px >= MEASURABLE_PX and not f.faults
+def _found_poses_yield(f: Findings) -> bool:
+    """Whether poses that matches gave yield to refined ones, against which nothing speaks.
 
-
-def _fit_matches_alone(f: Findings) -> bool:
-    """Whether left-out matches fit found poses worse than refined ones, and nothing speaks against these."""
-    doubted = _against(f) or f.faults or (f.epipolar is not None and f.epipolar.share_of_image > FITS_BELOW)
-    return f.compared_with == "seeded" and _matches_are_better(f) and not doubted
+    They do where the refined ones alone heed measured places, or fit left-out matches better.
+    """
+    if f.compared_with != "seeded" or f.faults or _against(f):
+        return False
+    heeded = f.favoured_by_positions is not None and f.moved_px >= MEASURABLE_PX
+    fits = f.epipolar is not None and f.epipolar.share_of_image <= FITS_BELOW
+    return heeded or (fits and _matches_are_better(f))
 
 
 def _counted(f: Findings) -> list[PairedDifference]:
