@@ -67,9 +67,11 @@ def test_true_poses_in_place_of_noisy_ones_are_an_improvement(scene, noisy):
 
 def test_true_poses_miss_the_photos_by_less_than_wrong_ones(scene):
     truth = scene[0].world_from_cam
-    noisy, other = (perturb_poses(truth, 0.3, seed=seed) for seed in (1, 2))
+    noisy, other = (perturb_poses(truth, 0.3, seed=seed) for seed in (2, 3))
     right, wrong = (judged(scene, noisy, refined).verdict.heldout.missed_px for refined in (truth, other))
     assert right < compare_rigs.BLUR_PX < wrong
+    # Whichever is better: photos that are near the input's renders tell that the refined poses are worse.
+    assert judged(scene, truth, noisy).verdict.heldout.missed_px < compare_rigs.BLUR_PX
 
 
 def test_other_views_are_left_out_only_until_they_decide(scene):
