@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import random
 from http import HTTPStatus
 from typing import Any
 
@@ -13,7 +14,8 @@ from workers.settings.errors import EngineError
 logger = logging.getLogger(__name__)
 
 MEDIA_TYPE = "application/problem+json"
-RETRY_AFTER_S = "5"
+# Drawn anew for each answer: clients refused together would come back together.
+RETRY_AFTER_S = (2, 12)
 # These end only when a job ends or its owner deletes something.
 _LONGER_S = {"queue_full": "30", "quota_exhausted": "60"}
 
@@ -109,7 +111,7 @@ class ProblemError(FaultError):
 
     def response_headers(self) -> dict[str, str]:
         """Extra headers of the response; a retryable one says when to retry."""
-        wait_s = _LONGER_S.get(self.code, RETRY_AFTER_S)
+        wait_s = _LONGER_S.get(self.code) or str(random.randint(*RETRY_AFTER_S))
         return {**({"Retry-After": wait_s} if self.retryable else {}), **self.headers}
 
     def problem(self, instance: str | None = None, request_id: str | None = None) -> Problem:

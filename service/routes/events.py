@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import random
 from collections.abc import AsyncGenerator, AsyncIterator
 from typing import Annotated, Any
 
@@ -18,9 +19,11 @@ from workers.settings.errors import NotFound, Unavailable
 
 router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["jobs"])
 KEEP_ALIVE_S = 15.0
-_RETRY_MS = 2000
+# Drawn anew for each stream: all that end with a process would come back together.
+RETRY_MS = (1000, 5000)
 # Another web process may be running already; the job continues.
-_GOODBYE = ": this process is stopping; connect again with the last event's id\nretry: 500\n\n"
+_GOODBYE_MS = (500, 2500)
+_GOODBYE = ": this process is stopping; connect again with the last event's id\n"
 _STREAM: dict[int | str, dict[str, Any]] = {
     200: {
         "description": (
@@ -90,7 +93,7 @@ async def _stream(
     update = first
     with service.metrics.listeners.track_inprogress():
         async with contextlib.aclosing(updates):
-            yield f"retry: {_RETRY_MS}\n\n"
+            yield _retry(RETRY_MS)
             while True:
                 yield ": still here\n\n" if update is None else _as_text(update)
                 if update is not None and update.job.final:
@@ -100,8 +103,12 @@ async def _stream(
                 except (StopAsyncIteration, NotFound, Unavailable):
                     # The job was deleted or the database is unavailable: the client reconnects and gets the error.
                     if service.closing.is_set():
-                        yield _GOODBYE
+                        yield _GOODBYE + _retry(_GOODBYE_MS)
                     return
+
+
+def _retry(within_ms: tuple[int, int]) -> str:
+    return f"retry: {random.randint(*within_ms)}\n\n"
 
 
 async def _next_or_closing(

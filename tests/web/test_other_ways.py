@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -63,6 +64,24 @@ def busy(service: Running, kitchen: Path, api: httpx.Client) -> str:
 
 def names(page: Page) -> list[str]:
     return page.locator(".job-card strong").all_inner_texts()
+
+
+def test_the_page_asks_again_only_when_an_overloaded_service_wants_it(page: Page, service: Running) -> None:
+    asked: list[float] = []
+
+    def overloaded_once(route: Route) -> None:
+        asked.append(time.monotonic())
+        if len(asked) == 1:
+            problem = {"code": "database_unavailable", "title": "Not now", "detail": "The database is busy."}
+            route.fulfill(status=503, headers={"Retry-After": "5"}, json=problem)
+        else:
+            route.continue_()
+
+    page.route("**/v1/jobs?*", overloaded_once)
+    page.goto(service.url)
+    expect(page.get_by_text("The database is busy.")).to_be_visible()
+    expect(page.get_by_text("The database is busy.")).to_be_hidden()
+    assert asked[1] - asked[0] >= 5
 
 
 def test_an_archive_goes_on_after_the_connection_broke(

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import hmac
 import re
 import secrets
+import time
 from collections.abc import Iterable
 from datetime import datetime, timedelta
 from typing import Any, Literal, get_args
@@ -27,6 +29,8 @@ _FORM = re.compile(r"(brn_[0-9A-Z]{10})_[A-Za-z0-9_-]{43}", re.ASCII)
 _NOBODY = bytes(32)
 # Not a write for each request of a busy client.
 _USED_EVERY_S = 60
+# How long "no key was made yet" is believed.
+NONE_MADE_S = 1.0
 
 
 class ApiKey(Record):
@@ -56,6 +60,8 @@ class KeyStore:
     def __init__(self, database: Database) -> None:
         self._database = database
         self._any_made = False
+        self._asked_at = -NONE_MADE_S
+        self._asking: asyncio.Task[None] | None = None
 
     async def create(
         self, tenant: str, name: str, scopes: Iterable[Scope], *, lives: timedelta | None = None
@@ -80,7 +86,8 @@ class KeyStore:
                 " VALUES (%s, %s, %s, %s, %s, %s, clock_timestamp() + %s::interval) RETURNING *",
                 *(new_id("key"), tenant, name, prefix, _digest(text), wanted, lives),
             )
-            return _key(row), text
+        self._any_made = True
+        return _key(row), text
 
     async def recognise(self, text: str) -> ApiKey:
         """The living key with this text; notes its use. Raises `KeyRefused`."""
@@ -106,11 +113,23 @@ class KeyStore:
         return _key(rows[0])
 
     async def any_made(self) -> bool:
-        """Whether a key was ever made. A revoked one counts: revoking the last must not open the doors."""
-        if not self._any_made:  # each request without a key asks
-            rows = await self._database.fetch("SELECT EXISTS (SELECT 1 FROM api_keys) AS any")
-            self._any_made = bool(rows[0]["any"])
+        """Whether a key was ever made. A revoked one counts: revoking the last must not open the doors.
+
+        Each request without a key asks, so "yes" is remembered for good and "no" for `NONE_MADE_S`.
+        """
+        if not self._any_made and time.monotonic() - self._asked_at >= NONE_MADE_S:
+            if self._asking is None:  # one question for all who ask meanwhile
+                self._asking = asyncio.create_task(self._ask())
+            await asyncio.shield(self._asking)
         return self._any_made
+
+    async def _ask(self) -> None:
+        asked_at = time.monotonic()
+        try:
+            rows = await self._database.fetch("SELECT EXISTS (SELECT 1 FROM api_keys) AS any")
+            self._any_made, self._asked_at = self._any_made or bool(rows[0]["any"]), asked_at
+        finally:
+            self._asking = None
 
     async def list(self, tenant: str | None = None) -> tuple[ApiKey, ...]:
         """The keys of a tenant, or all; oldest first."""

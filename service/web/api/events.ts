@@ -1,6 +1,6 @@
 // A job's server-sent events, read with fetch: EventSource cannot send an API key.
 import type { JobView } from "schemas";
-import { address, asProblem, checkKey, pause, Problem, withKey } from "./http";
+import { address, asProblem, checkKey, pause, Problem, RETRY_MS, withKey } from "./http";
 
 export interface JobEvent {
   seq: number;
@@ -19,8 +19,6 @@ interface JobEventHandlers {
   onConnection: (up: boolean) => void;
 }
 
-const RETRY_MS = 1500;
-
 /** Reads a job's events from the first one until it is over. Throws `Problem` if retrying cannot help. */
 export async function followJob(jobId: string, handlers: JobEventHandlers, signal: AbortSignal): Promise<void> {
   let last = 0;
@@ -37,20 +35,22 @@ export async function followJob(jobId: string, handlers: JobEventHandlers, signa
     handlers.onEvent(event);
   };
   while (!over && !signal.aborted) {
+    let pauseMs = RETRY_MS;
     try {
       const headers = withKey({ Accept: "text/event-stream", "Last-Event-ID": String(last) });
       const response = await fetch(address(`v1/jobs/${jobId}/events`), { headers, signal });
-      if (!response.ok) throw checkKey(Problem.of(response.status, await response.text(), null));
+      if (!response.ok) throw checkKey(Problem.of(response.status, await response.text(), response.headers.get("Retry-After")));
       handlers.onConnection(true);
       await read(response, handle);
     } catch (error) {
       if (signal.aborted) return;
       const problem = asProblem(error);
       if (problem.status && !problem.transient) throw problem;
+      pauseMs = problem.pauseMs;
     }
     if (!over && !signal.aborted) {
       handlers.onConnection(false);
-      await pause(RETRY_MS);
+      await pause(pauseMs);
     }
   }
 }

@@ -2,8 +2,6 @@
 import { useEffect, useState } from "preact/hooks";
 import { asProblem, pause, type Problem } from "./http";
 
-const RETRY_MS = 1500;
-
 /**
  * What `load` returns. It is loaded again after the milliseconds that `again` returns, never after null, and not while
  * the page is hidden.
@@ -32,7 +30,7 @@ export function useLoaded<T>(
           if (stop.signal.aborted) return;
           const failure = asProblem(error);
           setProblem(failure);
-          wait = failure.transient ? RETRY_MS : null;
+          wait = failure.transient ? failure.pauseMs : null;
         }
       }
     })();

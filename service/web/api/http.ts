@@ -3,6 +3,8 @@ import type { FieldProblem } from "schemas";
 import { Store } from "./store";
 
 const KEY_ITEM = "biresnerf-api-key";
+/** Between two tries where the service does not say when it wants the request again. */
+export const RETRY_MS = 1500;
 
 /** The API key, kept while the tab is open. */
 export const apiKey = new Store<string | null>(sessionStorage.getItem(KEY_ITEM));
@@ -49,6 +51,11 @@ export class Problem extends Error {
   /** Whether the same request may succeed later. */
   get transient(): boolean {
     return this.status === 0 || this.status === 429 || this.status >= 500;
+  }
+
+  /** Milliseconds to wait before the next try. */
+  get pauseMs(): number {
+    return Math.max(RETRY_MS, 1000 * this.waitS);
   }
 
   static unreachable(): Problem {

@@ -14,6 +14,7 @@ import psutil
 import pytest
 
 from biresnerf.client import Client
+from service.routes.events import RETRY_MS
 from tests.service.conftest import PATIENCE_S, Running, finished, problem, ready_dataset, submit, until
 
 
@@ -70,6 +71,15 @@ def test_a_stream_is_replayed_from_any_event(http: httpx.Client, done_job: dict[
     assert [m for m in both if "id" in m] == expected
     nothing = list(events(http, done_job, params={"after": whole[-1]["id"]}))
     assert [message["event"] for message in nothing] == ["progress"]
+
+
+def test_streams_that_end_together_are_not_told_to_come_back_together(
+    http: httpx.Client, done_job: dict[str, Any]
+) -> None:
+    told = [http.get(done_job["links"]["events"]).text.splitlines()[0] for _ in range(8)]
+    waits = {int(line.removeprefix("retry: ")) for line in told}
+    assert len(waits) > 4
+    assert all(RETRY_MS[0] <= wait <= RETRY_MS[1] for wait in waits)
 
 
 def test_bad_starts_and_missing_jobs_are_problems_not_streams(

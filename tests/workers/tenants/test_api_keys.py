@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import hmac
 from datetime import timedelta
 
@@ -9,8 +10,8 @@ import psycopg
 import pytest
 
 from biresnerf.errors import InputError
-from workers.engine import Stores
-from workers.settings.errors import NotFound
+from workers.engine import Stores, open_stores
+from workers.settings.errors import NotFound, Unavailable
 from workers.settings.settings import Settings
 from workers.tenants import api_keys
 from workers.tenants.api_keys import KeyRefused
@@ -91,3 +92,41 @@ async def test_a_revoked_key_still_counts_as_made(stores: Stores):
     key, _ = await stores.keys.create("anna", "n", ["read"])
     await stores.keys.revoke(key.id)
     assert await stores.keys.any_made()
+
+
+def transactions(stores: Stores) -> int:
+    return stores.keys._database.pool.get_stats()["requests_num"]
+
+
+async def test_requests_without_a_key_ask_the_database_once_a_second_until_a_key_is_made(
+    stores: Stores, settings: Settings
+):
+    before = transactions(stores)
+    for _ in range(3):
+        assert not any(await asyncio.gather(*(stores.keys.any_made() for _ in range(500))))
+    assert 1 <= transactions(stores) - before < 10  # the rounds may take more than a second
+    async with open_stores(settings) as elsewhere:
+        await elsewhere.keys.create("anna", "n", ["read"])
+    await asyncio.sleep(api_keys.NONE_MADE_S)
+    assert await stores.keys.any_made()
+    before = transactions(stores)
+    assert await stores.keys.any_made()
+    assert transactions(stores) == before
+
+
+async def test_a_key_made_by_the_process_itself_counts_at_once(stores: Stores):
+    assert not await stores.keys.any_made()
+    await stores.keys.create("anna", "n", ["read"])
+    assert await stores.keys.any_made()
+
+
+async def test_a_database_that_was_away_is_asked_again(stores: Stores, monkeypatch: pytest.MonkeyPatch):
+    pool = stores.keys._database.pool
+    monkeypatch.setattr(pool, "timeout", 0.2)
+    taken = [await pool.getconn() for _ in range(pool.max_size)]
+    asked = [asyncio.create_task(stores.keys.any_made()) for _ in range(20)]
+    for outcome in await asyncio.gather(*asked, return_exceptions=True):
+        assert isinstance(outcome, Unavailable)
+    for connection in taken:
+        await pool.putconn(connection)
+    assert not await stores.keys.any_made()
