@@ -12,7 +12,7 @@ import copy
 import linecache
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from unittest.mock import patch
@@ -29,8 +29,6 @@ from biresnerf.field.radiance_field import Marching, PositionGradient, Rays, Ren
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.refinement.optimise import cast_rays
 from biresnerf.refinement.optimise.joint_optimiser import OCCUPANCY_PERIOD, JointOptimiser
-from biresnerf.refinement.optimise.joint_step import StepNumbers, StepOutcome
-from biresnerf.refinement.optimise.step_graphs import StepGraphs
 from biresnerf.refinement.parameters import pose_parameters
 
 GPU = torch.device("meta")
@@ -52,12 +50,10 @@ class Trace:
     Attributes:
         launches: operations by name, views and empty buffers left out.
         crossings: lines of code that move values between host and device.
-        calls: every operation as its line of code, its name, its numbers and its tensors' shapes.
     """
 
     launches: Counter[str] = field(default_factory=Counter)
     crossings: list[str] = field(default_factory=list)
-    calls: Counter[tuple[str, str]] = field(default_factory=Counter)
 
 
 class Recorder(TorchDispatchMode):
@@ -71,17 +67,15 @@ class Recorder(TorchDispatchMode):
         devices = {tensor.device.type for tensor in _tensors((args, result)) if tensor.ndim}
         if name not in MOVES_NOTHING and "meta" in devices:
             self.trace.launches[name] += 1
-        line = _line()
         if devices == {"meta", "cpu"}:
-            self.trace.crossings.append(line)
-        self.trace.calls[line, f"{name} {_told((args, kwargs))}"] += 1
+            self.trace.crossings.append(_line())
         return result
 
 
 class PretendedField:
     """A field of two lines, differentiable in the rays."""
 
-    stratified, unbounded, place = None, False, 0
+    stratified, unbounded = None, False
 
     def reach(self, share: float) -> None:
         pass
@@ -93,38 +87,8 @@ class PretendedField:
     def step(self, rates: object) -> None:
         pass
 
-    def prepare(self, rays: int, *numbers: object) -> int:
-        return 100
-
-    def render_prepared(self, rays: Rays) -> Rendering:
-        return self.render(rays, None, None)
-
-    def step_prepared(self, rates: object) -> None:
-        pass
-
-    def finish(self) -> None:
-        pass
-
-    def state(self) -> dict[str, Tensor]:
-        return {"counters": torch.zeros(1)}
-
     def estimate(self, position: Tensor, count: Tensor) -> Tensor:
         return position.sum(1).abs()
-
-
-class PretendedGraphs(StepGraphs):
-    """Every step operation by operation, or every step as one launch."""
-
-    def __init__(self, optimiser: JointOptimiser, recorder: Recorder) -> None:
-        super().__init__(optimiser, check=tuple)
-        self.replayed, self._recorder = False, recorder
-
-    def _taken(self, told: StepNumbers, work: Callable[[], StepOutcome]) -> StepOutcome:
-        self._places_of(told)
-        if not self.replayed:
-            return work()
-        self._recorder.trace.launches["graph"] += 1
-        return StepOutcome(torch.empty((), device=GPU), torch.empty((), device=GPU), 0)
 
 
 class PretendedGenerator:
@@ -146,30 +110,14 @@ def pretended_directions(lenses: Intrinsics, image: Tensor, xy: Tensor) -> Tenso
     return torch.cat([xy.double() / lenses.fx[image, None], torch.ones_like(xy[:, :1])], 1)
 
 
-def traced_step(optimiser: JointOptimiser, *, looks_at_cells: bool = False, replayed: bool = False) -> Trace:
-    """What a step asks for.
+def traced_step(optimiser: JointOptimiser, *, looks_at_cells: bool = False) -> Trace:
+    """What a step asks for, after the one before it, which puts constants there.
 
     Args:
         looks_at_cells: whether it is one of those that update the occupancy grid.
-        replayed: whether a graph takes it.
     """
-    first = OCCUPANCY_PERIOD * 2 + (0 if looks_at_cells else 1)
-    return _traces(optimiser, [first], replayed=replayed)[0]
-
-
-def changing_lines(optimiser: JointOptimiser) -> set[str]:
-    """Lines of code whose operations or numbers are others in later steps with as many rays.
-
-    Where there are any, the CUDA graph of a whole step would repeat what the step did that was recorded.
-    """
-    first, *later = (trace.calls for trace in _traces(optimiser, [33, 34, 35, 36]))
-    return {line for calls in later for line, _ in (first - calls) + (calls - first)}
-
-
-def _traces(optimiser: JointOptimiser, steps: list[int], *, replayed: bool = False) -> list[Trace]:
-    """Of these steps, all with the same number of rays, after the one before them, which puts constants there."""
-    recorder, found = Recorder(), []
-    made = _on_pretended_gpu(optimiser, recorder)
+    recorder = Recorder()
+    made = _on_pretended_gpu(optimiser)
     rand, randint, rays = torch.rand, torch.randint, made.rays
 
     def launch(kernel: str, *arguments: object) -> None:
@@ -182,19 +130,15 @@ def _traces(optimiser: JointOptimiser, steps: list[int], *, replayed: bool = Fal
         patch.object(torch, "rand", lambda *size, generator=None, **where: rand(*size, **where)),
         patch.object(torch, "randint", lambda *size, generator=None, **where: randint(*size, **where)),
     ):
-        made.step_index = steps[0] - 1
+        made.step_index = 2 * OCCUPANCY_PERIOD - (1 if looks_at_cells else 0)
         made.step()
-        if made.graphs is not None:
-            made.graphs.replayed = replayed
-        for step in steps:
-            made.step_index, made.rays, recorder.trace = step, rays, Trace()
-            with recorder:
-                made.step()
-            found.append(recorder.trace)
-    return found
+        made.rays, recorder.trace = rays, Trace()
+        with recorder:
+            made.step()
+    return recorder.trace
 
 
-def _on_pretended_gpu(optimiser: JointOptimiser, recorder: Recorder) -> JointOptimiser:
+def _on_pretended_gpu(optimiser: JointOptimiser) -> JointOptimiser:
     """A copy of an optimiser with its tensors on the device, except counts of Adam's steps."""
 
     def moved(tensor: Tensor, memo: dict[int, Tensor]) -> Tensor:
@@ -212,8 +156,6 @@ def _on_pretended_gpu(optimiser: JointOptimiser, recorder: Recorder) -> JointOpt
         made = copy.deepcopy(optimiser, left)
     made.metrics, made.directions = PretendedMetrics(), pretended_directions
     made.occupancy = DeviceOccupancyGrid(optimiser.occupancy.side, GPU)
-    if not (optimiser.field.shape.broadcast or made.poses.double_step):
-        made.graphs = PretendedGraphs(made, recorder)
     return made
 
 
@@ -223,15 +165,6 @@ def _tensors(value: object) -> Iterator[Tensor]:
     elif isinstance(value, (tuple, list)):
         for part in value:
             yield from _tensors(part)
-
-
-def _told(value: object) -> object:
-    """Numbers as they are, tensors by their shapes."""
-    if isinstance(value, Tensor):
-        return tuple(value.shape)
-    if isinstance(value, dict):
-        return {name: _told(each) for name, each in value.items()}
-    return [_told(each) for each in value] if isinstance(value, (tuple, list)) else value
 
 
 def _line() -> str:
@@ -248,12 +181,9 @@ def main() -> None:
         optimiser = scene.untrained(images=100, threads=2, size=64, preset="paper")
         if stage == "fine":
             optimiser.start_reconstruction()
-        for how, replayed in (("one by one", False), ("by a graph", True)):
-            launches = traced_step(optimiser, replayed=replayed).launches
-            told = ", ".join(f"{n} {k}" for k, n in launches.most_common(12))
-            print(f"{stage}, {how}: {launches.total()} launches; {told}")
-        print("other numbers in later steps:")
-        print("", *sorted(changing_lines(optimiser)), sep="\n    ")
+        launches = traced_step(optimiser).launches
+        most = ", ".join(f"{n} {k}" for k, n in launches.most_common(12))
+        print(f"{stage}: {launches.total()} launches; {most}")
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 class Adam:
-    """Adam (Kingma and Ba 2015) on some parameters; the learning rate is given at each step, or lies on the device.
+    """Adam (Kingma and Ba 2015) on some parameters; the learning rate is given at each step.
 
     `torch.optim.Adam` takes the same steps, but loads torch's compiler: two seconds of every process. One kernel moves
     all parameters: a quarter of the time of an operation for each product and root on a CPU, one launch on a GPU.
@@ -32,8 +32,8 @@ class Adam:
         self._of_parameter: dict[int, dict[str, Tensor]] = {}
 
     @torch.no_grad()
-    def step(self, rate: float | Tensor) -> None:
-        """Move the parameters that have a gradient; `rate` is a number, or a tensor [] beside the parameters."""
+    def step(self, rate: float) -> None:
+        """Move the parameters that have a gradient."""
         parameters, gradients, histories = [], [], []
         for i, parameter in enumerate(self.parameters):
             if parameter.grad is not None:

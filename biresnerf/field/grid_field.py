@@ -108,16 +108,6 @@ class GridField(RadianceField):
         for name in self.modules:
             self.steps[name] += 1
             self._update_table(name, self._level_rates(name, rates))
-        self._move_weights(rates)
-
-    def _level_rates(self, name: str, rates: FieldRates) -> np.ndarray:
-        """The rate float32 [levels] of each level of a module."""
-        if name == "pose":
-            return np.full(self.shape.pose_grid.levels, rates.pose, np.float32)
-        return np.asarray(rates.reconstruction, np.float32)
-
-    def _move_weights(self, rates: FieldRates) -> None:
-        """Adam on the networks and the reconstruction module's columns; ends with no gradients."""
         if self._mixing is not None and self.networks[0].grad is not None:
             self._first.grad = self.networks[0].grad @ self._mixing.T
         self._networks_adam.step(rates.networks)
@@ -125,6 +115,12 @@ class GridField(RadianceField):
         if self.reconstructing:
             self._columns_adam.step(rates.reconstruction_columns)
         self.discard_gradients()
+
+    def _level_rates(self, name: str, rates: FieldRates) -> np.ndarray:
+        """The rate float32 [levels] of each level of a module."""
+        if name == "pose":
+            return np.full(self.shape.pose_grid.levels, rates.pose, np.float32)
+        return np.asarray(rates.reconstruction, np.float32)
 
     def discard_gradients(self) -> None:
         for parameter in (*self.tables.values(), self._first, *self.networks, self.reconstruction_columns):

@@ -81,15 +81,12 @@ class PositionGradient:
 
 @dataclass(frozen=True)
 class FieldRates:
-    """Rates of one step: pose module and networks, reconstruction module per level, its first-layer columns.
-
-    Those of networks and columns may lie in a device's memory.
-    """
+    """Rates of one step: pose module and networks, reconstruction module per level, its first-layer columns."""
 
     pose: float
-    networks: float | Tensor
+    networks: float
     reconstruction: tuple[float, ...]
-    reconstruction_columns: float | Tensor
+    reconstruction_columns: float
 
 
 @dataclass(frozen=True)
@@ -112,13 +109,11 @@ class RadianceField(ABC):
         unbounded: whether space outside the inner box [-1, 1]^3 is contracted.
         stratified: samples a ray gets, one from each of as many bins; None where rays are marched through the
             occupancy grid.
-        recordable: whether a step can be recorded, see `RecordableField`.
     """
 
     backend: str
     unbounded: bool
     stratified: int | None = None
-    recordable: bool = False
 
     @abstractmethod
     def render(self, rays: Rays, marching: Marching, gradient: PositionGradient) -> Rendering:
@@ -166,36 +161,3 @@ class RadianceField(ABC):
     @abstractmethod
     def reach(self, progress: float) -> None:
         """Set the completed share of the run, 0 to 1; a field that opens from coarse to fine follows it."""
-
-
-class RecordableField(RadianceField):
-    """A field that takes a step in two shares: the host's, then launches only, which a CUDA graph can repeat.
-
-    A step is `prepare`, `render_prepared`, backward, `step_prepared`, `finish`, with nothing in between.
-
-    Attributes:
-        place: another number where buffers have moved since.
-    """
-
-    place: int
-
-    @abstractmethod
-    def prepare(
-        self, rays: int, trained: int, marching: Marching, gradient: PositionGradient, rates: FieldRates
-    ) -> int | None:
-        """Write all that changes from step to step to the device's memory; returns the samples to expect.
-
-        None where the host has to see the rays first: then `render` and `step` take this step.
-        """
-
-    @abstractmethod
-    def render_prepared(self, rays: Rays) -> Rendering:
-        """`render` with the numbers that `prepare` wrote."""
-
-    @abstractmethod
-    def step_prepared(self, rates: FieldRates) -> None:
-        """`step` with the numbers that `prepare` wrote; the rates of networks and columns are on the device."""
-
-    @abstractmethod
-    def finish(self) -> None:
-        """The host's share after a step."""

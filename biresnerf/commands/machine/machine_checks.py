@@ -29,11 +29,9 @@ print(time.process_time() - began)
 _FIND_GPU = """
 import json, torch
 from biresnerf.field.backends import cuda_problem, gpu_faults
-from biresnerf.refinement.optimise.step_graphs import graph_faults
 problem = cuda_problem()
 faults = () if problem else gpu_faults(torch.device("cuda"))
-slower = () if problem or faults else graph_faults()
-print(json.dumps([problem, None if problem else torch.cuda.get_device_name(), faults, slower]))
+print(json.dumps([problem, None if problem else torch.cuda.get_device_name(), faults]))
 """
 
 # good: works; missing: only something optional is unavailable; broken: should work and does not.
@@ -88,7 +86,7 @@ def gpu() -> Found:
     output = _in_child("GPU", _FIND_GPU, _COMPILE_S, hint)
     if isinstance(output, Found):
         return output
-    problem, name, faults, slower = json.loads(output.splitlines()[-1])
+    problem, name, faults = json.loads(output.splitlines()[-1])
     if problem is not None:
         return Found(
             "GPU", "missing", f"not used: {problem}", "Optional: the CPU kernels do the same. docs/cuda.md"
@@ -98,12 +96,7 @@ def gpu() -> Found:
             "GPU", "broken", f"{name}: {'; '.join(faults)}",
             "Plain torch takes the place of its kernels. Update the driver, or use --device cpu. docs/cuda.md",
         )  # fmt: skip
-    if slower:
-        return Found(
-            "GPU", "broken", f"{name}: kernels checked, but {'; '.join(slower)}",
-            "Steps go on without CUDA graphs of whole steps, and take longer. Update the driver. docs/cuda.md",
-        )  # fmt: skip
-    return Found("GPU", "good", f"{name}, kernels and graphs of steps checked")
+    return Found("GPU", "good", f"{name}, kernels checked")
 
 
 def colmap() -> Found:

@@ -13,7 +13,6 @@ import subprocess
 import sys
 from functools import cache
 from importlib.metadata import version
-from importlib.util import find_spec
 from pathlib import Path
 
 import torch
@@ -54,14 +53,14 @@ _GRADIENT = PositionGradient(1.0, 0.5, 0.7)
 
 
 @cache
-def remembered_faults(module: str = __name__) -> tuple[str, ...]:
-    """What a check, run as a module, finds on this GPU; from the cache where an earlier one ran to its end."""
-    record, key = _cache_file(), _installation(module)
+def remembered_faults() -> tuple[str, ...]:
+    """What the check finds on this GPU; from the cache where an earlier one ran to its end."""
+    record, key = _cache_file(), _installation()
     known = _read(record)
     if key in known:
         return tuple(known[key])
-    logger.info("running %s on this GPU, once", module.rpartition(".")[2])
-    found = _check_in_own_process(module)
+    logger.info("checking the kernels on this GPU, once")
+    found = _check_in_own_process()
     if isinstance(found, str):  # a busy GPU may be free the next time
         return (found,)
     try:
@@ -81,9 +80,9 @@ def _read(record: Path) -> dict[str, list[str]]:
     return known if isinstance(known, dict) else {}
 
 
-def _check_in_own_process(module: str) -> list[str] | str:
+def _check_in_own_process() -> list[str] | str:
     """What it finds; or, where the check did not run to its end, why."""
-    command = [sys.executable, "-m", module]
+    command = [sys.executable, "-m", __name__]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False)
     except subprocess.TimeoutExpired:
@@ -94,20 +93,17 @@ def _check_in_own_process(module: str) -> list[str] | str:
     return f"the check failed: {last_words[-1]}"
 
 
-def _installation(module: str) -> str:
-    """GPU, driver, versions, and the text of the kernels and of what lies beside the check."""
+def _installation() -> str:
+    """GPU, driver, versions, and the text of the kernels."""
     device = torch.cuda.get_device_properties(torch.cuda.current_device())
-    found = find_spec(module)
-    assert found is not None
-    folders = {Path(__file__).parent, Path(str(found.origin)).parent}
-    text = b"".join(path.read_bytes() for folder in sorted(folders) for path in sorted(folder.rglob("*.py")))
+    text = b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.rglob("*.py")))
     driver = Path("/proc/driver/nvidia/version")
     parts = (
         f"{device.name} {device.major}.{device.minor}",
         driver.read_text().splitlines()[0] if driver.is_file() else "",
         f"torch {version('torch')} {torch.version.cuda}",
         f"triton {version('triton')}",
-        f"{module.rpartition('.')[2]} {hashlib.sha256(text).hexdigest()[:16]}",
+        f"kernels {hashlib.sha256(text).hexdigest()[:16]}",
     )
     return ", ".join(parts)
 

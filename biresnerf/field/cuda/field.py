@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -21,12 +20,10 @@ from biresnerf.field.cuda.sample_count import SampleCount
 from biresnerf.field.cuda.workspace import Capacity, Pass, Workspace
 from biresnerf.field.grid_field import BETA1, BETA2, GridField
 from biresnerf.field.radiance_field import (
-    FieldRates,
     FieldShape,
     Marching,
     PositionGradient,
     Rays,
-    RecordableField,
     Rendering,
 )
 
@@ -39,7 +36,7 @@ BOX_DIAGONAL = 2 * math.sqrt(3)
 RESULTS = ("ray_colour", "opacity", "depth")
 
 
-class CudaField(GridField, RecordableField):
+class CudaField(GridField):
     """Backend `cuda`.
 
     Args:
@@ -58,7 +55,6 @@ class CudaField(GridField, RecordableField):
         super().__init__(shape, seed, device)
         self._samples = self._samples_least = samples
         self._workspace: Workspace | None = None
-        self.place = 0
         self._sample_count = SampleCount(device)
         self._forward_number = 0  # of the forward pass whose samples the buffers hold
         self._pending: int | None = None  # the forward pass whose gradients wait for `step`
@@ -74,31 +70,6 @@ class CudaField(GridField, RecordableField):
     def _drop_workspace(self) -> None:
         self._workspace, self._pending = None, None
 
-    @property
-    def recordable(self) -> bool:  # type: ignore[override]
-        return not self.shape.broadcast  # whose levels are mixed anew in each step
-
-    def prepare(
-        self, rays: int, trained: int, marching: Marching, gradient: PositionGradient, rates: FieldRates
-    ) -> int | None:
-        samples = self._foreseen(rays, marching)
-        if samples is not None:
-            of_tables: dict[str, float | Sequence[float]] = {}
-            for name in self.modules:
-                of_tables |= self._rates(name, self._level_rates(name, rates), self.steps[name] + 1)
-            self._begin(Pass(rays, trained, marching, gradient, samples), of_tables)
-        return samples
-
-    def step_prepared(self, rates: FieldRates) -> None:
-        for name in self.modules:
-            self._launch_update(name)
-        self._move_weights(rates)
-
-    def finish(self) -> None:
-        for name in self.modules:
-            self.steps[name] += 1
-        self._note()
-
     def render(self, rays: Rays, marching: Marching, gradient: PositionGradient) -> Rendering:
         moving = rays.origin.requires_grad or rays.direction.requires_grad
         if not (torch.is_grad_enabled() and (moving or rays.trained)):
@@ -108,15 +79,11 @@ class CudaField(GridField, RecordableField):
         if samples is None:
             samples = self._counted(rays, marching, gradient)
         self._begin(Pass(count, rays.trained, marching, gradient, samples))
-        rendering = self.render_prepared(rays)
-        self._note()
-        return rendering
-
-    def render_prepared(self, rays: Rays) -> Rendering:
-        samples = self._pass.samples
-        return Rendering(
+        rendering = Rendering(
             *RenderRays.apply(rays.origin, rays.direction, self.networks[0], self, rays), samples
         )
+        self._note()
+        return rendering
 
     def density(self, position: Tensor) -> Tensor:
         return self._density(position, None, whole=True)
@@ -218,22 +185,13 @@ class CudaField(GridField, RecordableField):
         return w.buffers["g_origin"][:count].clone(), w.buffers["g_direction"][:count].clone()
 
     def _update_table(self, name: str, rates: np.ndarray) -> None:
-        if self._pending is not None and self._workspace is not None:
-            self._workspace.write_controls(self._rates(name, rates, self.steps[name]))
-        self._launch_update(name)
-
-    @staticmethod
-    def _rates(name: str, rates: np.ndarray, step: int) -> dict[str, float | Sequence[float]]:
-        """The numbers of Adam's step on a table."""
-        corrections = (1 / (1 - BETA1**step), 1 / math.sqrt(1 - BETA2**step))
-        return {f"{name}_rates": rates.tolist(), f"{name}_corrections": corrections}
-
-    def _launch_update(self, name: str) -> None:
-        w = self._workspace
+        w, step = self._workspace, self.steps[name]
         if self._pending is None:
             return
         if w is None or self._pending != self._forward_number:
             raise RuntimeError("the field was used for something else between backward and step")
+        corrections = (1 / (1 - BETA1**step), 1 / math.sqrt(1 - BETA2**step))
+        w.write_controls({f"{name}_rates": rates.tolist(), f"{name}_corrections": corrections})
         w.plan(plans.update, name).run()
 
     def discard_gradients(self) -> None:
@@ -262,18 +220,17 @@ class CudaField(GridField, RecordableField):
         held = None
         self._workspace = None  # frees its memory before the larger one takes its own
         self._forward_number += 1
-        self.place += 1
         self._workspace = Workspace(self, Capacity(rays, self._samples, max(before.most, most), side))
         return self._workspace
 
-    def _begin(self, of: Pass, others: Mapping[str, float | Sequence[float]] | None = None) -> None:
-        """Write the numbers of a pass, and others, to the device."""
+    def _begin(self, of: Pass) -> None:
+        """Write the numbers of a pass to the device."""
         w = self._workspace
         assert w is not None
         self._forward_number += 1
         self._pass = of
         w.buffers["occupied"].copy_(of.marching.occupied)
-        w.write_controls({**of.controls(), **(others or {})})
+        w.write_controls(of.controls())
         w.record()
 
     def _write_rays(self, w: Workspace, rays: Rays) -> None:

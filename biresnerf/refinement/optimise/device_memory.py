@@ -34,8 +34,6 @@ def step_that_fits(optimiser: JointOptimiser) -> StepResult:
         optimiser.batch_share /= 2
         optimiser.rays = max(optimiser.method.rays_least, optimiser.rays // 2)
         optimiser.field.release_memory()
-        if optimiser.graphs is not None:
-            optimiser.graphs.forget()
         torch.cuda.empty_cache()
         logger.warning("%s", smaller_batches(optimiser)[0])
 

@@ -25,7 +25,6 @@ from biresnerf.refinement.optimise.methods import find_method
 from biresnerf.refinement.optimise.optimiser_state import Part, StepState, load_state_of, state_of
 from biresnerf.refinement.optimise.photo_sampler import PhotoSampler
 from biresnerf.refinement.optimise.pose_hypotheses import photo_distances
-from biresnerf.refinement.optimise.step_graphs import StepGraphs
 from biresnerf.refinement.parameters.exposure import Exposure
 from biresnerf.refinement.parameters.intrinsics_parameters import IntrinsicsParameters
 from biresnerf.refinement.parameters.pose_parameters import PoseParameters
@@ -99,7 +98,6 @@ class JointOptimiser:
         self.mobility[:, torch.from_numpy(self.bodies.fixed).to(device)] = 0.0
         guess = self.schedule.samples(0, None) // (self.field.stratified or FIRST_SAMPLES)
         self.rays = max(self.method.rays_least, guess)
-        self.graphs = StepGraphs(self) if StepGraphs.can_take(self) else None
 
     @cached_property
     def photo_distances(self) -> NDArray[np.float32]:
@@ -178,7 +176,7 @@ class JointOptimiser:
         if t % OCCUPANCY_PERIOD == 0 and self.method.pruned:
             self._update_occupancy(t)
         told = step_numbers(self)
-        done = joint_step(self, told, self.field) if self.graphs is None else self.graphs.step(told)
+        done = joint_step(self, told)
         self.step_index += 1
         self._adapt_rays(done.samples, int(self.batch_share * schedule.samples(t, self.switch)))
         loss, error = self.metrics.read(done.loss, done.error)
@@ -226,8 +224,6 @@ class JointOptimiser:
         wanted = self.rays * budget / max(1, samples)
         wanted = min(max(wanted, self.rays / 1.5), self.rays * 1.5)
         self.rays = int(min(max(wanted, self.method.rays_least), RAYS_MOST))
-        if self.graphs is not None:
-            self.rays = self.graphs.rays_of_size(self.rays)
 
     def coarse_state(self) -> dict[str, Tensor]:
         """The tensors of stage 1: all but the reconstruction module, which has not moved."""

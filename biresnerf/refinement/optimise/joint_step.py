@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from biresnerf.field.radiance_field import FieldRates, Marching, PositionGradient, Rays, Rendering
+from biresnerf.field.radiance_field import FieldRates, Marching, PositionGradient
 from biresnerf.refinement.optimise.cast_rays import cast_rays, viewing_directions
 from biresnerf.refinement.optimise.photo_sampler import PixelBatch
 
@@ -19,11 +19,8 @@ if TYPE_CHECKING:
 class StepNumbers:
     """All that changes from step to step, besides tensors and random numbers.
 
-    Rates and blur lie in the device's memory where a step is recorded, so that its repetitions have others.
-
     Attributes:
-        blur: standard deviation (px) of the photos' blur before its random factor; or see
-            `PhotoSampler.draw_recordable`.
+        blur: standard deviation (px) of the photos' blur before its random factor.
         moves_focal: whether focal lengths move, where lenses do.
     """
 
@@ -31,11 +28,9 @@ class StepNumbers:
     marching: Marching
     gradient: PositionGradient
     rates: FieldRates
-    blur: float | Tensor | None
-    pose_rate: float | Tensor
-    lens_rate: float | Tensor
-    moves_poses: bool
-    moves_lenses: bool
+    blur: float
+    pose_rate: float
+    lens_rate: float
     moves_focal: bool
 
 
@@ -46,13 +41,6 @@ class StepOutcome:
     loss: Tensor
     error: Tensor
     samples: int
-
-
-class SteppedField(Protocol):
-    """What a step asks of a field, see `RadianceField`."""
-
-    def render(self, rays: Rays, marching: Marching, gradient: PositionGradient) -> Rendering: ...
-    def step(self, rates: FieldRates) -> None: ...
 
 
 def step_numbers(optimiser: JointOptimiser) -> StepNumbers:
@@ -69,26 +57,19 @@ def step_numbers(optimiser: JointOptimiser) -> StepNumbers:
         blur=schedule.blur(t, switch, optimiser.sampler.long_side),
         pose_rate=rate,
         lens_rate=lens_rate,
-        moves_poses=rate > 0,
-        moves_lenses=lens_rate > 0,
         moves_focal=schedule.focal_moves(switch),
     )
 
 
-def joint_step(optimiser: JointOptimiser, told: StepNumbers, field: SteppedField) -> StepOutcome:
-    """Draw pixels, render them, and move field, poses, lenses and exposures by the gradients of the loss.
-
-    Nothing else of the host's may change here: a recorded step is repeated without it.
-    """
-    poses, exposure = optimiser.poses, optimiser.exposure
-    if isinstance(told.blur, float):
-        batch = optimiser.sampler.draw(told.rays, told.blur, optimiser.draws)
-    else:
-        batch = optimiser.sampler.draw_recordable(told.rays, told.blur, optimiser.draws)
+def joint_step(optimiser: JointOptimiser, told: StepNumbers) -> StepOutcome:
+    """Draw pixels, render them, and move field, poses, lenses and exposures by the gradients of the loss."""
+    field, poses, exposure = optimiser.field, optimiser.poses, optimiser.exposure
+    moves_poses, moves_lenses = told.pose_rate > 0, told.lens_rate > 0
+    batch = optimiser.sampler.draw(told.rays, told.blur, optimiser.draws)
     matrices = poses.matrices()
-    if not told.moves_poses:
+    if not moves_poses:
         matrices = matrices.detach()
-    if told.moves_lenses:
+    if moves_lenses:
         matrices, lenses = optimiser.lenses.with_gradient(matrices)
     else:
         lenses = optimiser.intrinsics
@@ -101,10 +82,10 @@ def joint_step(optimiser: JointOptimiser, told: StepNumbers, field: SteppedField
     loss.backward()
     field.step(told.rates)
     exposure.step(told.rates.networks)
-    if told.moves_poses:
+    if moves_poses:
         mobility = optimiser.mobility[0 if optimiser.switch is None else 1]
         poses.step(told.pose_rate, mobility, field_rate=told.rates.networks)
-        if told.moves_lenses:
+        if moves_lenses:
             poses.dolly(optimiser.lenses.step(told.lens_rate, focal=told.moves_focal))
     shown = colour.detach().clamp(max=1)
     optimiser.camera_errors.add(batch.image, shown, batch.target, rendering.opacity.detach(), batch.weight)

@@ -99,43 +99,14 @@ class PhotoSampler:
         target = sharp if sigma <= LEVEL_SIGMA else self._blurred(image, xy, sigma)
         return PixelBatch(image, xy, target, sharp, weight, trained)
 
-    def draw_recordable(self, rays: int, blur: Tensor | None, generator: torch.Generator) -> PixelBatch:
-        """The same of all images by the same launches every time; `blur` [2] is `random_blur` on the device."""
-        position, trained = self._positions_in_turn(rays, generator), self.trained(rays)
-        image, xy, sharp, weight = self._drawn_at(position, generator)
-        target = sharp
-        if blur is not None:
-            level, share = blur[:1].long(), blur[1]
-            target = self._bilinear(level, image, xy) * (1 - share)
-            target = target + self._bilinear(level + 1, image, xy) * share
-        return PixelBatch(image, xy, target, sharp, weight, trained)
-
-    def random_blur(self, blur_px: float, generator: torch.Generator) -> tuple[int, float]:
-        """A random share of `blur_px`, as a level of the pyramid and the share of the next one."""
-        # Level 0 is sharp at the centres of pixels.
-        sigma = max(blur_px * self._share(generator), LEVEL_SIGMA)
-        level = min(math.log2(sigma / LEVEL_SIGMA), PYRAMID_LEVELS - 1.0)
-        lower = min(int(level), PYRAMID_LEVELS - 2)
-        return lower, level - lower
-
-    def trained(self, rays: int) -> int:
-        """How many of so many rays are of training views, where the host does not wait for a count."""
-        return round(rays * self.training / len(self.order))
-
     def defined_draw(self, rays: int, generator: torch.Generator, held_out_only: bool) -> Drawn:
         """Image, pixel centre, colour and weight of each ray, and how many are of training views."""
         position, trained = self._positions(rays, generator, held_out_only)
-        return *self._drawn_at(position, generator), trained
-
-    def _drawn_at(
-        self, position: Tensor, generator: torch.Generator
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Image, pixel centre, colour and weight of a ray of each of these places in `order`."""
-        image, rays = self.order[position], len(position)
+        image = self.order[position]
         share = torch.rand(rays, 2, generator=generator, device=generator.device).to(self.device)
         pixel, weight = self.chances.draw(image, share)
         sharp = self.pixels[self.offsets[0][image] + pixel].float() / 255
-        return image, self._centre(image, pixel), sharp, weight
+        return image, self._centre(image, pixel), sharp, weight, trained
 
     def _drawn_at_once(self, rays: int, generator: torch.Generator, held_out_only: bool) -> Drawn:
         """The same from the same random numbers in one kernel, on a CPU."""
@@ -176,16 +147,12 @@ class PhotoSampler:
             position = self._spread(rays, views, generator)
             return position, int((position < self.training).sum())
         # On a GPU the host would have to wait for that sum, so it fixes the number, equal to within a ray.
-        return self._positions_in_turn(rays, generator), self.trained(rays)
-
-    def _positions_in_turn(self, rays: int, generator: torch.Generator) -> Tensor:
-        """The same of all images, those of training views first."""
-        views, trained = len(self.order), self.trained(rays)
+        trained = round(rays * self.training / views)
         parts = (
             turned(self._spread(trained, self.training, generator), self.training, generator),
             self.training + self._spread(rays - trained, views - self.training, generator),
         )
-        return torch.cat(parts)
+        return torch.cat(parts), trained
 
     def _spread(self, rays: int, count: int, generator: torch.Generator) -> Tensor:
         """`rays` places in [0, count): one at random in each of as many equal parts."""
@@ -215,7 +182,7 @@ class PhotoSampler:
             colour = colour + self._bilinear(lower + 1, image, xy) * share
         return colour
 
-    def _bilinear(self, level: int | Tensor, image: Tensor, xy: Tensor) -> Tensor:
+    def _bilinear(self, level: int, image: Tensor, xy: Tensor) -> Tensor:
         size = self.sizes[level, image]
         at = xy * (size / self.sizes[0][image]) - 0.5
         low = at.floor()

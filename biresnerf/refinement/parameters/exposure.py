@@ -108,7 +108,7 @@ class Exposure:
         return torch.where((target >= SATURATED) & (colour > target), target, colour)
 
     @torch.no_grad()
-    def step(self, rate: float | Tensor) -> None:
+    def step(self, rate: float) -> None:
         """One step of Adam from the gradients of the last backward; `rate` is the networks'."""
         if self.log_gain.grad is None:
             return

@@ -138,10 +138,6 @@ class IntrinsicsParameters:
                 self._present = self.differentiable()
         return self._present
 
-    def forget_present(self) -> None:
-        """Compute them again when they are next asked for: increments have moved."""
-        self._present = None
-
     def differentiable(self) -> Intrinsics:
         """The same as a function of the increments."""
         q = torch.where(self.free, self.increments, self.increments.detach())[self.of_image]
@@ -171,7 +167,7 @@ class IntrinsicsParameters:
             self.differentiable()
         )
 
-    def step(self, rate: float | Tensor, *, focal: bool = True) -> Tensor:
+    def step(self, rate: float, *, focal: bool = True) -> Tensor:
         """A step of Adam; returns the log focal length by which each image's camera is to dolly, [images].
 
         Args:
@@ -189,7 +185,7 @@ class IntrinsicsParameters:
 
     @torch.no_grad()
     def _moved(self, before: Tensor) -> Tensor:
-        self.forget_present()
+        self._present = None
         moved = ((self.increments - before) * self.free)[:, FOCAL][self.of_image]
         return moved if self.dollies else torch.zeros_like(moved)
 
@@ -213,7 +209,7 @@ class IntrinsicsParameters:
         groups = zip(self.given.terms, (used[:4], used[4:7], used[7:]), strict=True)
         above, below, tangential = (max(t, int(g.nonzero().max()) + 1 if g.any() else 0) for t, g in groups)
         self.given = replace(self.given, terms=(above, below, tangential))
-        self.forget_present()
+        self._present = None
 
     def at(self, increments: Tensor) -> IntrinsicsParameters:
         """These lenses at another moment's increments [cameras, columns]: to be looked at, not to be stepped."""

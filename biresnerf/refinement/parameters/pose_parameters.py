@@ -84,9 +84,7 @@ class PoseParameters:
         bottom = torch.tensor([0.0, 0, 0, 1], dtype=torch.float64).expand(len(top), 1, 4)
         return torch.cat([top, bottom], 1)
 
-    def step(
-        self, rate: float | Tensor, mobility: Tensor | None = None, field_rate: float | Tensor = 0.0
-    ) -> None:
+    def step(self, rate: float, mobility: Tensor | None = None, field_rate: float = 0.0) -> None:
         """A step of Adam, and of the second at `field_rate`; `mobility` [n] is each camera's own factor of both.
 
         A body moves as far as its least mobile camera.

@@ -18,7 +18,6 @@ from biresnerf.refinement.finish.time_budget import budget_warnings
 from biresnerf.refinement.lost.own_matches import LEAST_PAIRS
 from biresnerf.refinement.optimise.device_memory import smaller_batches
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
-from biresnerf.refinement.optimise.step_graphs import slower_steps
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.two_stages import TwoStages
 from biresnerf.refinement.start.choose_start import MARGIN_DB
@@ -90,7 +89,6 @@ def run_report(
         + one_place_warnings(scene.tracks, refined)
         + gpu_warnings(optimiser.device)
         + smaller_batches(optimiser)
-        + slower_steps(optimiser)
         + budget_warnings(stages)
         + _unknown_warnings(dataset, uncertainty),
     )

@@ -64,10 +64,10 @@ def test_each_gpu_is_checked_once(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     checked = []
     monkeypatch.setattr(
-        device_check, "_check_in_own_process", lambda module: checked.append(1) or ["colour differs"]
+        device_check, "_check_in_own_process", lambda: checked.append(1) or ["colour differs"]
     )
     for name, expected in (("one GPU", 1), ("one GPU", 1), ("another GPU", 2)):
-        monkeypatch.setattr(device_check, "_installation", lambda module, name=name: name)
+        monkeypatch.setattr(device_check, "_installation", lambda name=name: name)
         device_check.remembered_faults.cache_clear()
         assert device_check.remembered_faults() == ("colour differs",)
         assert len(checked) == expected
@@ -77,12 +77,12 @@ def test_each_gpu_is_checked_once(tmp_path, monkeypatch):
 
 def test_a_check_that_did_not_end_is_run_again(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(device_check, "_installation", lambda module: "a busy GPU")
+    monkeypatch.setattr(device_check, "_installation", lambda: "a busy GPU")
     for answer, expected in (
         ("the check failed: out of memory", ("the check failed: out of memory",)),
         ([], ()),
     ):
-        monkeypatch.setattr(device_check, "_check_in_own_process", lambda module, answer=answer: answer)
+        monkeypatch.setattr(device_check, "_check_in_own_process", lambda answer=answer: answer)
         device_check.remembered_faults.cache_clear()
         assert device_check.remembered_faults() == expected
     device_check.remembered_faults.cache_clear()
@@ -92,7 +92,7 @@ def test_a_check_that_cannot_run_is_a_fault(monkeypatch):
     if torch.cuda.is_available():
         pytest.skip("there is a GPU, on which the check does not fail")
     monkeypatch.delenv("TRITON_INTERPRET", raising=False)
-    fault = device_check._check_in_own_process(device_check.__name__)
+    fault = device_check._check_in_own_process()
     assert fault.startswith("the check failed")
     assert "CUDA" in fault or "NVIDIA" in fault
 

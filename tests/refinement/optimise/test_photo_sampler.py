@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from biresnerf.refinement.optimise.photo_sampler import LEVEL_SIGMA, PYRAMID_LEVELS, PhotoSampler, turned
+from biresnerf.refinement.optimise.photo_sampler import PhotoSampler, turned
 from tests.refinement.optimise.test_masked_photos import two_coloured
 from tests.refinement.tiny_scene import CPU, photos_set
 
@@ -182,23 +182,3 @@ def test_turned_places_stay_evenly_spread_and_each_is_last_as_often():
         assert each.max() - each.min() <= 1
         last[found[-1]] += 1
     assert (last / draws - 1 / count).abs().max() < 5 * (1 / count / draws) ** 0.5
-
-
-@pytest.mark.parametrize("images", [photos_set(noise_photos()), two_coloured()], ids=["all count", "masked"])
-def test_a_recordable_draw_is_blurred_as_its_numbers_say(images):
-    sampler = PhotoSampler(images, [], CPU)
-    for sigma in (0.6, 1.0, 1.7, 7.9, 30.0):
-        level = min(np.log2(sigma / LEVEL_SIGMA), PYRAMID_LEVELS - 1)
-        lower = min(int(level), PYRAMID_LEVELS - 2)
-        batch = sampler.draw_recordable(500, torch.tensor([lower, level - lower]), generator())
-        expected = sampler.colours(batch.image, batch.xy, sigma)
-        torch.testing.assert_close(batch.target, expected, atol=1e-5, rtol=1e-5)
-    sharp = sampler.draw_recordable(500, torch.tensor(sampler.random_blur(0.0, generator())), generator())
-    assert torch.equal(sharp.target, sharp.sharp)
-
-
-def test_a_random_blur_is_between_none_and_as_much_as_asked():
-    sampler, draws = PhotoSampler(photos_set(noise_photos()), [], CPU), generator()
-    levels = np.array([sum(sampler.random_blur(4.0, draws)) for _ in range(1000)])
-    assert levels.min() == 0
-    assert 2.9 < levels.max() < 3  # 0.5 * 2**3 px
