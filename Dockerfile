@@ -76,13 +76,13 @@ RUN if [ -n "${SYSTEM_PACKAGES}" ]; then \
     fi \
     && groupadd --system --gid 10001 biresnerf \
     && useradd --system --uid 10001 --gid biresnerf --home-dir /var/lib/biresnerf --no-create-home biresnerf \
-    && install -d -o biresnerf -g biresnerf -m 0750 /var/lib/biresnerf
+    && install -d -o biresnerf -g biresnerf -m 0750 /var/lib/biresnerf /backups
 COPY --from=build /opt/venv /opt/venv
 COPY --from=build /opt/kernels /opt/kernels
 COPY deploy/entrypoint.py deploy/health.py /opt/biresnerf/
 
 # BIRESNERF_DATA_DIR holds scratch alone where the database and the files are elsewhere. It is the only folder
-# that is written to, beside /tmp: everything else may be read-only.
+# that is written to, beside /tmp and a volume for backups: everything else may be read-only.
 ENV PATH=/opt/venv/bin:${PATH} \
     PYTHONDONTWRITEBYTECODE=1 \
     PYTHONUNBUFFERED=1 \

@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Builds the image, runs compose.yaml for real with podman, loses a worker in mid job, and sees the result.
+# Builds the image, runs compose.yaml for real with podman, loses a worker in mid job, and sees the result. Then loses
+# database and files, and sees it again from a backup.
 #
 #   make compose-check                       (root; Debian or Ubuntu; 10 GB in $TMPDIR; a quarter of an hour or more)
 #   KEEP=1 make compose-check                keeps the images for the next time
@@ -26,6 +27,7 @@ since() { python3 -c "print(f'{$(now) - $1:.1f}')"; }
 by_service() { podman ps -q --filter "label=com.docker.compose.project=$project" --filter "label=com.docker.compose.service=$1"; }
 all_of() { podman ps -aq --filter "label=com.docker.compose.project=$project" --filter "label=com.docker.compose.service=$1"; }
 compose() { COMPOSE_PROFILES=cpu "$work/venv/bin/podman-compose" --in-pod=false -p "$project" --profile cpu "$@"; }
+of_backups() { "$work/venv/bin/podman-compose" --in-pod=false -p "$project" --profile backup run --rm backup "$@"; }
 
 # --- what it needs -----------------------------------------------------------------------------------------------
 
@@ -210,6 +212,31 @@ assert 'transforms.json' in names and len(names) == len(set(names)), names
 print(len(names), 'files in the result')"
   curl -sf -H "Authorization: Bearer $key" "$url/v1/jobs/$id/artifacts/transforms.json" -o "$work/transforms.json"
   python3 -c "import json; assert len(json.load(open('$work/transforms.json'))['frames']) == 16"
+  lose_all_but_backups "$id"
+}
+
+# The database and the files are lost, the backups are not.
+lose_all_but_backups() {
+  say "backup, loss of database and files, restore"
+  local id=$1 before; before=$(job "$id")
+  of_backups >"$work/backup.log" 2>&1 || { cat "$work/backup.log"; fail "backup"; }
+  compose down -t 20 >"$work/lost.log" 2>&1
+  podman volume rm "${project}_database" "${project}_files" >/dev/null
+  compose up -d postgres store >>"$work/lost.log" 2>&1
+  local began; began=$(now)
+  until podman healthcheck run "$(by_service postgres)" >/dev/null && podman healthcheck run "$(by_service store)" >/dev/null; do
+    [ "$(since "$began" | cut -d. -f1)" -lt 120 ] || { logs; fail "no database after 120 s"; }
+    sleep 0.5
+  done
+  of_backups biresnerf restore /backups/biresnerf >"$work/restore.log" 2>&1 || { cat "$work/restore.log"; fail "restore"; }
+  compose up -d >>"$work/lost.log" 2>&1
+  until curl -sfo /dev/null "$url/readyz"; do
+    [ "$(since "$began" | cut -d. -f1)" -lt 300 ] || { logs; fail "not ready after the restore"; }
+    sleep 0.5
+  done
+  figure "restore: until ready again, s" "$(since "$began")"
+  [ "$(job "$id")" = "$before" ] || { job "$id"; fail "the job is another after the restore"; }
+  curl -sf -H "Authorization: Bearer $key" "$url/v1/jobs/$id/artifacts/transforms.json" | cmp - "$work/transforms.json"
 }
 
 still() { [ "$(since "$2" | cut -d. -f1)" -lt "$3" ] || { job "$1"; logs; fail "waited $3 s"; }; }

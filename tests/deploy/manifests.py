@@ -58,7 +58,8 @@ def pod_templates(manifests: tuple[Manifest, ...]) -> Iterator[tuple[str, Manife
     """Name and pod template of each object that makes pods."""
     for item in manifests:
         spec = item.get("spec", {})
-        template = spec.get("jobTargetRef", spec).get("template")
+        spec = spec.get("jobTargetRef", spec.get("jobTemplate", {}).get("spec", spec))
+        template = spec.get("template")
         if template is not None:
             yield item["metadata"]["name"], template
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from tests.docs.forms_of_commands import command_context
 from workers.settings.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -42,7 +43,7 @@ def test_every_service_is_held_in(name):
     assert {"memory", "pids"} <= set(service["deploy"]["resources"]["limits"])
 
 
-@pytest.mark.parametrize("name", ["postgres", "store", "migrate", "worker", "worker-gpu"])
+@pytest.mark.parametrize("name", ["backup", "postgres", "store", "migrate", "worker", "worker-gpu"])
 def test_what_serves_no_stranger_reaches_no_stranger(name):
     assert SERVICES[name]["networks"] == ["back"]
     assert COMPOSE["networks"]["back"] == {"internal": True}
@@ -58,6 +59,21 @@ def test_secrets_come_as_files_that_prepare_makes(name):
         assert not re.search(r"(PASSWORD|SECRET|TOKEN|KEY|DATABASE_URL)", variable) or variable.endswith(
             "_FILE"
         )
+
+
+def test_backups_have_a_volume_that_the_image_s_user_owns_and_nothing_else_starts():
+    """A volume without files gets the owner that the image gives the folder."""
+    backup = SERVICES["backup"]
+    (volume,) = backup["volumes"]
+    named, folder = re.fullmatch(r"\$\{BIRESNERF_BACKUPS:-(\w+)\}:(/\w+)", volume).groups()
+    assert named in COMPOSE["volumes"]
+    assert re.search(rf"install -d -o biresnerf .* {folder}( |$)", (ROOT / "Dockerfile").read_text(), re.M)
+    context = command_context(backup["command"][1:])
+    assert (context.info_name, context.params["folder"].parent) == ("backup", Path(folder))
+    # It is run, never started beside the service; and a database is restored into before it is migrated.
+    assert backup["profiles"] == ["backup"]
+    assert "depends_on" not in backup
+    assert backup["environment"] == SERVICES["worker"]["environment"]
 
 
 def test_workers_alone_have_less_than_the_usual_weight():

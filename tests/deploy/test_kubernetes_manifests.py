@@ -85,7 +85,9 @@ def test_every_pod_keeps_the_restricted_standard(overlay: str):
             "capabilities": {"drop": ["ALL"]},
         }, name
         for volume in pod["volumes"]:
-            assert set(volume) - {"name"} <= {"emptyDir", "secret", "configMap"}, name
+            assert set(volume) - {"name"} <= {"emptyDir", "secret", "configMap", "persistentVolumeClaim"}, (
+                name
+            )
         assert not any("hostPort" in port for port in one.get("ports", [])), name
         assert pod["automountServiceAccountToken"] is False, name
         assert {"memory"} <= set(one["resources"]["limits"]), name
@@ -94,9 +96,9 @@ def test_every_pod_keeps_the_restricted_standard(overlay: str):
     assert labels["pod-security.kubernetes.io/enforce"] == "restricted"
 
 
-def test_four_kinds_of_pods_are_made():
+def test_five_kinds_of_pods_are_made():
     names = {name.removeprefix("biresnerf-") for name, _ in pod_templates(rendered("cpu"))}
-    assert names == {"api", "dispatcher", "migrate", "worker"}
+    assert names == {"api", "backup", "dispatcher", "migrate", "worker"}
 
 
 @each_overlay
@@ -179,7 +181,7 @@ def test_whatever_is_named_is_there(overlay: str):
         return sum(selector.items() <= labels.items() for labels in pods)
 
     policies = [item for item in manifests if item["kind"] == "NetworkPolicy"]
-    assert [chosen(item["spec"]["podSelector"].get("matchLabels", {})) for item in policies] == [4, 4, 1, 1]
+    assert [chosen(item["spec"]["podSelector"].get("matchLabels", {})) for item in policies] == [5, 5, 1, 1]
     service = only(manifests, "Service", "biresnerf-api")["spec"]
     budget = only(manifests, "PodDisruptionBudget", "biresnerf-api")["spec"]
     assert chosen(service["selector"]) == chosen(budget["selector"]["matchLabels"]) == 1

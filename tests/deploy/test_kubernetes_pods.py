@@ -6,13 +6,17 @@ The cluster's part is played here: KEDA's query and its arithmetic, a pod's fold
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import importlib.util
+import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping
+import uuid
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import httpx
@@ -22,13 +26,15 @@ import pytest
 from tests.deploy.keda_schemas import workers_to_start
 from tests.deploy.manifests import ROOT, Manifest, container, only, pod_templates, rendered
 from tests.service.free_port import free_port
-from tests.workers.buckets import environment_of, fresh_bucket, moto_server
+from tests.workers.buckets import by_boto, environment_of, fresh_bucket, moto_server
 from tests.workers.conftest import PATIENCE_S, Counting, Slots, environment, quick_settings
+from workers.engine import open_stores
 from workers.process.exit_status import ExitStatus
 from workers.settings.settings import Settings
 
 pytestmark = pytest.mark.anyio
 SCALED = "biresnerf-worker"
+PAGE = (ROOT / "docs/kubernetes.md").read_text("utf-8")
 METRICS_TOKEN = "of-those-who-scrape"
 
 
@@ -73,7 +79,7 @@ class Cluster:
         inherited = {key: value for key, value in os.environ.items() if not key.startswith("BIRESNERF_")}
         with (self._folder / f"pod{len(self.pods)}.log").open("ab") as log:
             process = subprocess.Popen(
-                [sys.executable, "-m", "biresnerf.command_line", *one["args"][1:]],
+                [sys.executable, "-m", "biresnerf.command_line", *self._on_volumes(one["args"][1:])],
                 env={**inherited, **said, **changes},
                 stdout=log,
                 stderr=log,
@@ -82,6 +88,9 @@ class Cluster:
         self._slots.processes.append(process)
         self.pods.append((process, scratch))
         return process, scratch
+
+    def _on_volumes(self, words: list[str]) -> list[str]:
+        return [word.replace("/backups", str(self._folder / "backups")) for word in words]
 
 
 @pytest.fixture
@@ -196,3 +205,91 @@ async def test_the_other_pods_end_as_their_manifests_expect(cluster: Cluster, tm
     dispatcher.terminate()
     grace_s = pods["biresnerf-dispatcher"]["spec"]["terminationGracePeriodSeconds"]
     assert await asyncio.to_thread(dispatcher.wait, grace_s) == 0
+
+
+@pytest.fixture
+def loses(server: str) -> Iterator[Callable[[], str]]:
+    """Drops a database of its own where there is one, and gives the address of a new one."""
+    name = f"lost_{uuid.uuid4().hex[:12]}"
+    with psycopg.connect(server, autocommit=True) as connection:
+
+        def drop() -> None:
+            connection.execute(f"DROP DATABASE IF EXISTS {name} WITH (FORCE)".encode())
+
+        def lose() -> str:
+            drop()
+            connection.execute(f"CREATE DATABASE {name}".encode())
+            return server.replace("/postgres?", f"/{name}?")
+
+        yield lose
+        drop()
+
+
+def job_that_restores() -> Manifest:
+    """The pod that the page makes of the CronJob's."""
+    template = dict(pod_templates(rendered("cpu")))["biresnerf-backup"]
+    (patch,) = re.findall(r"kubectl patch --local -f - --type json .*\n +-p '(\[.*\])'", PAGE)
+    job = {
+        "apiVersion": "batch/v1",
+        "kind": "Job",
+        "metadata": {"name": "restore"},
+        "spec": {"template": template},
+    }
+    command = ["kubectl", "patch", "--local", "-f", "-", "--type", "json", "-p", patch, "-o", "json"]
+    done = subprocess.run(command, input=json.dumps(job), capture_output=True, text=True, check=True)
+    restored: Manifest = json.loads(done.stdout)["spec"]["template"]
+    return restored
+
+
+async def test_after_database_and_bucket_are_lost_the_backup_brings_back_jobs_files_and_keys(
+    loses: Callable[[], str], bucket: Mapping[str, str], slots: Slots, tmp_path: Path
+):
+    place = fresh_bucket(bucket["storage_endpoint"])
+    settings = quick_settings(tmp_path / "outside", database_url=loses(), **environment_of(place))
+    cluster, pods = Cluster(settings, slots, tmp_path), dict(pod_templates(rendered("cpu")))
+
+    async def ends_well(template: Manifest) -> None:
+        process, _ = cluster.start(template)
+        assert await asyncio.to_thread(process.wait, PATIENCE_S) == 0
+
+    async def told(key: str, *paths: str) -> dict[str, bytes]:
+        """What the service answers, and the files of the result."""
+        port = free_port()
+        process, _ = cluster.start(pods["biresnerf-api"], BIRESNERF_PORT=str(port))
+        with httpx.Client(
+            base_url=f"http://127.0.0.1:{port}", headers={"authorization": f"Bearer {key}"}
+        ) as client:
+
+            def is_up() -> bool:
+                with contextlib.suppress(httpx.TransportError):
+                    return client.get("/readyz").status_code == 200
+                return False
+
+            await until(is_up, "the web process is ready")
+            found = {path: client.get(path).raise_for_status().content for path in paths}
+            for item in client.get(paths[-1]).json()["items"]:
+                found[item["href"]] = client.get(item["href"]).raise_for_status().content
+        process.terminate()
+        await asyncio.to_thread(process.wait, PATIENCE_S)
+        return found
+
+    await ends_well(pods["biresnerf-migrate"])
+    async with open_stores(settings) as stores:
+        counting = Counting(stores, tmp_path / "journal")
+        done = await counting.submit(3, 0.01)
+        await ends_well(pods[SCALED])
+        waits = await counting.submit(3, 0.01)
+        _, key = await stores.keys.create("local", "mine", ["read"])
+    asked = (f"/v1/jobs/{done}", f"/v1/jobs/{waits}", "/v1/datasets", f"/v1/jobs/{done}/artifacts")
+    before = await told(key, *asked)
+    assert len(before) == len(asked) + 3
+    await ends_well(pods["biresnerf-backup"])
+
+    loses()
+    for item in by_boto(place).list_objects_v2(Bucket=place.name)["Contents"]:
+        by_boto(place).delete_object(Bucket=place.name, Key=item["Key"])
+    await ends_well(job_that_restores())
+    assert await told(key, *asked) == before
+    await ends_well(pods[SCALED])
+    async with open_stores(settings) as stores:
+        assert (await stores.jobs.get(waits)).state == "succeeded"

@@ -164,9 +164,9 @@ def _sh(words: list[str], _text: str) -> None:
 
 def _kubectl(words: list[str], text: str) -> None:
     # "mine" is the overlay that the reader makes, as tests/deploy/test_kubernetes_manifests.py does.
-    places = re.findall(r"(?:-f|-k) (\S+)", text)
+    places = re.findall(r"(?:-f|-k) ([^\s-]\S*)", text)
     _exist([place.replace("overlays/mine", "overlays/cpu") for place in places])
-    known = {"apply", "create", "delete", "exec", "kustomize", "label", "rollout", "wait"}
+    known = {"apply", "create", "delete", "exec", "kustomize", "label", "patch", "rollout", "wait"}
     assert known & set(words), f"kubectl has no command for {text!r}"
     if "--" in words:
         command_context(words[words.index("--") + 2 :])

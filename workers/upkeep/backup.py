@@ -10,6 +10,7 @@ import contextlib
 import logging
 import os
 import shutil
+import subprocess
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -28,9 +29,11 @@ from workers.upkeep.backup_folder import (
     TOP_FOLDERS,
     BackupIndex,
     SavedFile,
+    connection_of,
+    marks,
     path_in,
+    postgres_program,
     read_index,
-    run_postgres_program,
     sha256_of,
 )
 
@@ -43,12 +46,18 @@ _STEPS = "SELECT name FROM schema_steps ORDER BY name"
 async def make_backup(settings: Settings, url: str, folder: Path) -> BackupIndex:
     """Update the backup in ``folder`` from the database at ``url`` and its files; returns its index.
 
-    ``gone`` of the index lists files deleted during the backup. Raises `SetupError`, `Unavailable` (the
-    store), `OSError` (the folder); the previous backup then stays complete.
+    ``gone`` of the index lists files deleted during the backup. Raises `SetupError` (also where the backup there is of
+    another store), `Unavailable` (the store), `OSError` (the folder); the previous backup then stays complete.
     """
     _prepare(folder)
     before = {file.key: file for file in read_index(folder).files} if (folder / INDEX_NAME).exists() else {}
     store = open_files(settings)
+    found, ours = await marks(store, folder)
+    if ours is not None and found != ours:
+        raise SetupError(
+            "folder_unusable",
+            f"{folder} holds the backup of another installation. Restore it, or name another.",
+        )
     saved: dict[str, SavedFile] = {}
     for found in await _stored(store):
         with contextlib.suppress(NotFound):  # deleted after it was listed
@@ -69,15 +78,20 @@ async def make_backup(settings: Settings, url: str, folder: Path) -> BackupIndex
             files=tuple(saved[key] for key in sorted(saved)),
             gone=tuple(sorted(named - saved.keys())),
         )
-        options = (
-            *("--format=custom", "--no-owner", "--no-privileges", "--no-unlogged-table-data"),
-            f"--snapshot={moment}",
-        )
-        target = f"--file={folder / index.database}"
-        await asyncio.to_thread(run_postgres_program, settings, url, "pg_dump", *options, target)
+        await asyncio.to_thread(_dump, settings, url, folder / index.database, moment)
     _write_whole(folder / INDEX_NAME, index.model_dump_json(indent=1).encode())
     _prune(folder, index)
     return index
+
+
+def _dump(settings: Settings, url: str, target: Path, moment: str) -> None:
+    """Write the database to ``target``, as the snapshot ``moment`` shows it; raises `SetupError`."""
+    leads_there, variables = connection_of(url)
+    options = ("--format=custom", "--no-owner", "--no-privileges", "--no-unlogged-table-data")
+    command = [postgres_program(settings, "pg_dump"), *options, f"--snapshot={moment}", f"--file={target}"]
+    ended = subprocess.run([*command, leads_there], env=variables, capture_output=True, text=True)
+    if ended.returncode != 0:
+        raise SetupError("pg_dump_failed", f"pg_dump failed: {ended.stderr.strip()[-1500:]}")
 
 
 async def _rows(connection: psycopg.AsyncConnection, sql: str) -> list[tuple[Any, ...]]:

@@ -6,9 +6,9 @@ change under their key, so the next backup into the folder copies only new ones.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
-import subprocess
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,10 @@ from pydantic import ValidationError
 
 from biresnerf.wire.base import Record
 from workers.database.postgres_binaries import find_binaries
-from workers.settings.errors import SetupError
+from workers.settings.errors import NotFound, SetupError
 from workers.settings.settings import Settings
+from workers.store.files import FileStore
+from workers.store.store_identity import MARK_KEY
 
 MARKER_NAME = "biresnerf-backup"
 INDEX_NAME = "backup.json"
@@ -68,29 +70,38 @@ def path_in(folder: Path, key: str) -> Path:
     return folder.joinpath(FILES_NAME, *parts)
 
 
+async def marks(store: FileStore, folder: Path) -> tuple[bytes | None, bytes | None]:
+    """The marks of the store and of the backup, by which they know their database; None where there is none yet."""
+    found = ours = None
+    with contextlib.suppress(NotFound):
+        found = b"".join([chunk async for chunk in store.read(MARK_KEY)])
+    with contextlib.suppress(FileNotFoundError):
+        ours = path_in(folder, MARK_KEY).read_bytes()
+    return found, ours
+
+
 def sha256_of(path: Path) -> str:
     """Digest of a local file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def run_postgres_program(settings: Settings, url: str, name: str, *arguments: str) -> None:
-    """Run ``pg_dump`` or ``pg_restore`` on the database at ``url``; raises `SetupError` with its output."""
+def postgres_program(settings: Settings, name: str) -> str:
+    """Path of ``pg_dump``, ``pg_restore`` or ``psql``; raises `SetupError` where there is none."""
     program = find_binaries(settings.pg_bin) / name
     if not program.is_file():
         raise SetupError(
             "no_pg_dump", f"There is no {program}. Set BIRESNERF_PG_BIN to a folder that has it."
         )
+    return str(program)
+
+
+def connection_of(url: str) -> tuple[str, dict[str, str]]:
+    """The option that leads such a program to the database at ``url``, and its environment.
+
+    The password is not on the command line, which every user of the machine can read.
+    """
     parts: dict[str, Any] = conninfo_to_dict(url)
-    password = parts.pop(
-        "password", None
-    )  # not on the command line, which every user of the machine can read
+    password = parts.pop("password", None)
     variables = {} if password is None else {"PGPASSWORD": str(password)}
-    ended = subprocess.run(
-        [str(program), *arguments, f"--dbname={make_conninfo(**parts)}"],
-        env={**os.environ, **variables},
-        capture_output=True,
-        text=True,
-    )
-    if ended.returncode != 0:
-        raise SetupError(f"{name}_failed", f"{name} failed: {ended.stderr.strip()[-1500:]}")
+    return f"--dbname={make_conninfo(**parts)}", {**os.environ, **variables}

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import subprocess
+import tempfile
 from collections.abc import AsyncIterator
 from pathlib import Path
 
@@ -11,11 +14,22 @@ import psycopg
 from biresnerf.errors import InputError
 from workers.database.migrate import migrate
 from workers.jobs.job_expiry import FORGET_CHECKPOINTS
-from workers.settings.errors import NotFound, SetupError
+from workers.settings.errors import SetupError
 from workers.settings.settings import Settings
 from workers.store.files import CHUNK_BYTES, FileStore, open_files
-from workers.store.store_identity import MARK_KEY
-from workers.upkeep.backup_folder import BackupIndex, path_in, read_index, run_postgres_program
+from workers.upkeep.backup_folder import (
+    BackupIndex,
+    connection_of,
+    marks,
+    path_in,
+    postgres_program,
+    read_index,
+)
+
+_TIMEOUT = b"SET transaction_timeout = 0;\n"
+_TIMEOUT_OF_ANY = (
+    b"SELECT set_config(name, '0', false) FROM pg_settings WHERE name = 'transaction_timeout';\n"
+)
 
 
 async def restore_backup(settings: Settings, url: str, folder: Path) -> BackupIndex:
@@ -34,17 +48,53 @@ async def restore_backup(settings: Settings, url: str, folder: Path) -> BackupIn
         raise SetupError(
             "backup_damaged", f"{len(damaged)} files of the backup are damaged or missing: {damaged[:5]}."
         )
-    await asyncio.to_thread(
-        run_postgres_program,
-        settings,
-        url,
-        "pg_restore",
-        *("--single-transaction", "--exit-on-error", "--no-owner", "--no-privileges"),
-        str(folder / index.database),
-    )
+    await asyncio.to_thread(_restore_database, settings, url, folder / index.database)
     migrate(url)
     _forget_lost_checkpoints(url, index)
     return index
+
+
+def _restore_database(settings: Settings, url: str, dump: Path) -> None:
+    """Run the dump's SQL as one transaction; raises `SetupError`, the database being as it was.
+
+    pg_restore itself could not fill a server before 17: it sends `_TIMEOUT`, whatever the server's version.
+    """
+    making = [
+        postgres_program(settings, "pg_restore"),
+        "--file=-",
+        "--no-owner",
+        "--no-privileges",
+        str(dump),
+    ]
+    leads_there, variables = connection_of(url)
+    running = [
+        postgres_program(settings, "psql"),
+        "--no-psqlrc",
+        "--quiet",
+        "--set=ON_ERROR_STOP=1",
+        leads_there,
+    ]
+    with (
+        tempfile.TemporaryFile() as said,
+        subprocess.Popen(making, stdout=subprocess.PIPE, stderr=said) as made,
+        subprocess.Popen(
+            running, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=said, env=variables
+        ) as run,
+    ):
+        assert made.stdout is not None
+        assert run.stdin is not None
+        with contextlib.suppress(BrokenPipeError):  # psql has ended, and said why
+            run.stdin.write(b"BEGIN;\n")
+            run.stdin.writelines(_TIMEOUT_OF_ANY if line == _TIMEOUT else line for line in made.stdout)
+            if made.wait() == 0:
+                run.stdin.write(b"COMMIT;\n")
+        made.stdout.close()
+        run.communicate()
+        said.seek(0)
+        if made.wait() != 0 or run.returncode != 0:
+            why = said.read().decode(errors="replace").strip()
+            ends = f"pg_restore ended with {made.returncode}, psql with {run.returncode}"
+            raise SetupError("pg_restore_failed", f"The dump cannot be restored ({ends}): {why[:1500]}")
 
 
 def _forget_lost_checkpoints(url: str, index: BackupIndex) -> None:
@@ -67,12 +117,8 @@ def _require_empty(url: str) -> None:
 
 async def _require_own_store(store: FileStore, folder: Path) -> None:
     """The store must be new, or hold what a restore of this backup began; its mark tells."""
-    try:
-        found = b"".join([chunk async for chunk in store.read(MARK_KEY)])
-        ours = path_in(folder, MARK_KEY).read_bytes()
-    except (NotFound, FileNotFoundError):
-        return
-    if found != ours:
+    found, ours = await marks(store, folder)
+    if found is not None and ours is not None and found != ours:
         raise SetupError(
             "store_not_empty", "The file store belongs to another installation. Use an empty one."
         )

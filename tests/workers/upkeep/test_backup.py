@@ -28,10 +28,12 @@ from tests.workers.conftest import (
 )
 from workers.database.embedded_postgres import EmbeddedPostgres
 from workers.database.migrate import migrate
+from workers.database.postgres_binaries import find_binaries, server_version
 from workers.engine import open_stores
 from workers.settings.errors import SetupError
 from workers.settings.settings import Settings
 from workers.upkeep.backup import make_backup
+from workers.upkeep.backup_folder import path_in, read_index
 from workers.upkeep.restore import restore_backup
 
 pytestmark = [pytest.mark.server, pytest.mark.anyio]
@@ -44,10 +46,10 @@ def home() -> Iterator[Path]:
 
 
 @asynccontextmanager
-async def empty(data_dir: Path) -> AsyncIterator[Settings]:
+async def empty(data_dir: Path, pg_bin: Path | None = None) -> AsyncIterator[Settings]:
     """The private database of an installation, up for the block, with settings that lead to it."""
     private = quick_settings(data_dir)
-    postgres = EmbeddedPostgres(private.postgres_dir)
+    postgres = EmbeddedPostgres(private.postgres_dir, pg_bin=pg_bin)
     try:
         yield private.model_copy(update={"database_url": postgres.start()})
     finally:
@@ -55,9 +57,9 @@ async def empty(data_dir: Path) -> AsyncIterator[Settings]:
 
 
 @asynccontextmanager
-async def running(data_dir: Path) -> AsyncIterator[Settings]:
+async def running(data_dir: Path, pg_bin: Path | None = None) -> AsyncIterator[Settings]:
     """The same, migrated."""
-    async with empty(data_dir) as settings:
+    async with empty(data_dir, pg_bin) as settings:
         migrate(settings.require_database_url())
         yield settings
 
@@ -168,6 +170,65 @@ async def test_what_lies_in_a_bucket_comes_back_into_another_one(home: Path):
                     file.path: b"".join([chunk async for chunk in stores.files.read(file.key)])
                     for file in found
                 } == content
+
+
+async def test_a_backup_is_not_replaced_by_that_of_an_installation_with_other_files(home: Path):
+    """As a nightly backup would, once database and files are lost and empty ones have taken their place."""
+    backup = home / "backup"
+    for name in ("data", "new"):
+        async with running(home / name) as settings:
+            url = settings.require_database_url()
+            if name == "data":
+                async with open_stores(settings) as stores:
+                    await ready_dataset(stores, {"a.txt": b"abc"})
+                before = await make_backup(settings, url, backup)
+                continue
+            with pytest.raises(SetupError, match="another installation"):  # nothing has used it yet
+                await make_backup(settings, url, backup)
+            async with open_stores(settings):
+                pass
+            with pytest.raises(SetupError, match="another installation"):
+                await make_backup(settings, url, backup)
+    assert read_index(backup) == before
+    assert all(path_in(backup, file.key).is_file() for file in before.files)
+
+
+async def test_a_server_older_than_the_programs_gets_its_database_back(home: Path):
+    """From 17 on, what pg_restore says first is an error to servers before 17."""
+    backup, older = home / "backup", find_binaries(None).parents[1] / "pginstall/bin"
+    assert (
+        int(server_version(older).split(".")[0])
+        < 17
+        <= int(server_version(find_binaries(None)).split(".")[0])
+    )
+    async with running(home / "data", older) as settings, open_stores(settings) as stores:
+        dataset_id = await ready_dataset(stores, {"a.txt": b"abc"})
+        await make_backup(settings, settings.require_database_url(), backup)
+    async with empty(home / "other", older) as settings:
+        await restore_backup(settings, settings.require_database_url(), backup)
+        async with open_stores(settings) as stores:
+            assert (await stores.datasets.get(dataset_id)).state == "ready"
+
+
+async def test_a_restore_that_breaks_off_leaves_the_database_empty(home: Path, tmp_path: Path):
+    backup, programs = home / "backup", find_binaries(None)
+    async with running(home / "data") as settings, open_stores(settings) as stores:
+        await ready_dataset(stores, {"a.txt": b"abc"})
+        await make_backup(settings, settings.require_database_url(), backup)
+    for name in ("initdb", "postgres", "psql", "pg_restore"):
+        (tmp_path / name).write_text(f'#!/bin/sh\nexec {programs / name} "$@"\n')
+        (tmp_path / name).chmod(0o755)
+    # Killed between two statements, when the tables are there and their rows are not.
+    breaks_off = f"#!/bin/sh\n{programs / 'pg_restore'} \"$@\" | sed '/^COPY/,$d'\nkill -KILL $$\n"
+    (tmp_path / "pg_restore").write_text(breaks_off)
+    async with empty(home / "other") as settings:
+        url = settings.require_database_url()
+        with pytest.raises(SetupError) as told:
+            await restore_backup(settings.model_copy(update={"pg_bin": tmp_path}), url, backup)
+        assert told.value.code == "pg_restore_failed"
+        with psycopg.connect(url) as connection:
+            assert connection.execute("SELECT to_regclass('jobs')").fetchone() == (None,)
+        await restore_backup(settings, url, backup)
 
 
 async def test_a_damaged_backup_or_a_place_that_is_taken_is_refused_and_left_as_it_was(home: Path):
