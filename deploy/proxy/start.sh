@@ -5,7 +5,15 @@ nameserver=$(awk '/^nameserver/ { print $2; exit }' /etc/resolv.conf)
 case "$nameserver" in *:*) nameserver="[$nameserver]" ;; esac
 echo "resolver $nameserver valid=5s;" > /tmp/resolver.conf
 
-if [ -r /run/secrets/tls_certificate ]; then
+# compose.tls.yaml asks for TLS and publishes every address: without it, keys would go there in clear text.
+if [ -n "${TLS:-}" ] || [ -e /run/secrets/tls_certificate ]; then
+  for file in /run/secrets/tls_certificate /run/secrets/tls_key; do
+    if [ ! -r "$file" ]; then
+      echo "start.sh: TLS is asked for, but user $(id -u) cannot read $file. Let it read the file that TLS_CERTIFICATE" \
+        "or TLS_KEY names." >&2
+      exit 1
+    fi
+  done
   cat > /tmp/listen.conf <<'TLS'
 listen 8443 ssl;
 ssl_certificate /run/secrets/tls_certificate;
