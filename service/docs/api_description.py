@@ -28,7 +28,10 @@ _NEXT = {
 }
 # Problems of every operation, and of those with a JSON body; `REFUSALS` are those of guarded operations.
 _ANY = ("malformed_request", "head_timeout", "headers_too_large", "internal_error")
-_JSON_BODY = ("malformed_json", "body_too_large", "unsupported_media", "body_timeout", "invalid_request")
+_JSON_BODY = (
+    *("malformed_json", "body_too_large", "unsupported_media", "body_timeout", "invalid_request"),
+    "too_many_uploads",
+)
 # FastAPI's own 422, which this service never sends.
 _UNUSED = ("HTTPValidationError", "ValidationError")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import re
 from collections import Counter
-from collections.abc import Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,6 +25,8 @@ from workers.process.turns import Turns
 from workers.settings.settings import Settings
 
 Listing = TypeVar("Listing", bound=BaseModel)
+# Bodies as they came; their values take about ten times as much, one body after the other.
+JSON_BYTES_AT_ONCE = 32 * 2**20
 _ID = re.compile(r"^[a-z]{2,3}_[0-9A-Za-z]{1,40}$", re.ASCII)
 
 
@@ -60,6 +62,49 @@ class UploadLimit:
                 del self._running[client]
 
 
+class BodyLimit:
+    """How many bytes of JSON bodies one web process holds at once, in all; each client may hold half.
+
+    The first `FREE_BYTES` of each body are not counted, so that usual requests pass whoever sends large ones.
+    """
+
+    FREE_BYTES = 64 * 2**10
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._held: Counter[str | None] = Counter()
+
+    @contextmanager
+    def counted(self, client: str | None) -> Iterator[Callable[[int], None]]:
+        """Counts one body while the context lasts; tell the function how many of its bytes there are.
+
+        A body that is the only one may be larger than the limit. The function raises ``ProblemError``
+        (``too_many_uploads``).
+        """
+        mine = 0
+
+        def hold(size: int) -> None:
+            nonlocal mine
+            more = max(0, size - self.FREE_BYTES) - mine
+            share = self._limit if client is None else self._limit // 2
+            for held, limit in ((self._held.total(), self._limit), (self._held[client], share)):
+                if more and held > mine and held + more > limit:
+                    raise ProblemError(
+                        "too_many_uploads",
+                        f"The bodies under way have more than {limit} bytes, which is the limit.",
+                        hint="Continue when one of them is done.",
+                    )
+            mine += more
+            self._held[client] += more
+
+        try:
+            yield hold
+        finally:
+            self._held[client] -= mine
+            if not self._held[client]:
+                del self._held[client]
+
+
 @dataclass
 class Service:
     """The running process: its settings, the engine, and its background tasks."""
@@ -74,6 +119,7 @@ class Service:
     unpacking: Turns = field(init=False)
     decoding: Turns = field(init=False)
     sending: UploadLimit = field(init=False)
+    bodies: BodyLimit = field(default_factory=lambda: BodyLimit(JSON_BYTES_AT_ONCE))
 
     def __post_init__(self) -> None:
         self.memory = memory_shares(memory_limit(), self.settings.processes)

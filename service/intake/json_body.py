@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Coroutine, Iterable
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterable
+from contextlib import asynccontextmanager
 from typing import Any, TypeVar
 
 from fastapi import Request, Response
@@ -12,6 +13,7 @@ from pydantic import BaseModel, ValidationError
 from starlette.types import Scope
 
 from biresnerf.wire.problems import FieldProblem
+from service.http.dependencies import service_of
 from service.http.problems import ProblemError
 from service.intake.uploads import limited_body
 
@@ -31,9 +33,8 @@ class JsonRoute(APIRoute):
         async def handle_strictly(request: Request) -> Response:
             if not field.field_info.is_required() and not request.headers.get("content-type"):
                 return await handle(request)
-            return await handle(
-                _ReadRequest(request.scope, await read_json(request, self.bytes_max(request)))
-            )
+            async with read_json(request, self.bytes_max(request)) as values:
+                return await handle(_ReadRequest(request.scope, values))
 
         return handle_strictly
 
@@ -50,11 +51,12 @@ class _ReadRequest(Request):
         self._body, self._json = b"read", values
 
 
-async def read_json(request: Request, limit: int = JSON_BYTES_MAX) -> Any:
-    """The values of the body, which has ``limit`` bytes at most.
+@asynccontextmanager
+async def read_json(request: Request, limit: int = JSON_BYTES_MAX) -> AsyncIterator[Any]:
+    """The values of the body, which has ``limit`` bytes at most and counts while the context lasts.
 
     Raises:
-        ProblemError: ``unsupported_media``, ``body_too_large``, ``malformed_json``.
+        ProblemError: ``unsupported_media``, ``body_too_large``, ``too_many_uploads``, ``malformed_json``.
     """
     content_type = request.headers.get("content-type", "")
     if content_type.split(";")[0].strip().lower() != "application/json":
@@ -63,8 +65,14 @@ async def read_json(request: Request, limit: int = JSON_BYTES_MAX) -> Any:
             f"The Content-Type {content_type!r} is not application/json.",
             where="Content-Type",
         )
-    body = b"".join([chunk async for chunk in limited_body(request, limit)])
-    return load_json(body)
+    body = bytearray()
+    with service_of(request).bodies.counted(request.state.client) as hold:
+        async for chunk in limited_body(request, limit):
+            hold(len(body) + len(chunk))
+            body += chunk
+        values = load_json(bytes(body))
+        body.clear()
+        yield values
 
 
 def load_json(text: bytes | str) -> Any:

@@ -78,7 +78,8 @@ async def submit_job(
     if kind == "multipart/form-data":
         job, new = await submit_form(caller, request, idempotency_key)
     elif kind == "application/json":
-        body = validate(await read_json(request), NewJob)
+        async with read_json(request) as values:
+            body = validate(values, NewJob)
         job, new = await caller.jobs.submit(
             body.dataset_id,
             body.options,
