@@ -19,7 +19,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Each process of the tests would compile all modules, and pytest rewrite all assertions, again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup web test test-fast test-kernels test-lowest coverage lint format demo serve bench field-check docs docs-site notebooks screenshots fuzz promises audit sbom compose-check slurm-check consumers-check
+.PHONY: help setup web test test-nightly test-fast test-kernels test-lowest coverage lint format demo serve bench field-check docs docs-site notebooks screenshots fuzz promises audit sbom compose-check slurm-check consumers-check
 .DELETE_ON_ERROR:
 
 help:  ## what there is
@@ -30,17 +30,20 @@ setup: $(INSTALLED)  ## the environment in .venv, with everything installed
 web: setup  ## build the page and what report.html is made of, after a change of their sources
 	$(BIN)/python hatch_build.py
 
-test: web  ## all tests; PYTEST="-k name" chooses
-	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --maxprocesses 4 --dist loadfile $(PYTEST)
+test: web  ## all tests but those of test-nightly; PYTEST="-k name" chooses
+	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --maxprocesses 4 --dist loadfile -m "not nightly" $(PYTEST)
+
+test-nightly: web  ## what takes long and seldom fails alone: deployment, pages' commands, notebooks, fuzz, storms, studies, benchmarks
+	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --maxprocesses 4 --dist loadfile -m nightly $(PYTEST)
 
 test-fast: setup  ## within a minute: the tests that need no server and no browser and do not train
-	$(BIN)/python -m pytest -n logical --maxprocesses 4 --dist worksteal -m "not server and not browser and not slow" $(PYTEST)
+	$(BIN)/python -m pytest -n logical --maxprocesses 4 --dist worksteal -m "not server and not browser and not slow and not nightly" $(PYTEST)
 
 test-kernels: setup  ## the tests of the CPU kernels, compiled for a processor without AVX and fused products
 	NUMBA_CPU_NAME=nehalem NUMBA_CPU_FEATURES= $(BIN)/python -m pytest -n 0 tests/field/cpu tests/refinement/kernels $(PYTEST)
 
 test-lowest: build/lowest.txt  ## all tests with the lowest versions that pyproject.toml allows, in an environment of its own
-	NUMBA_CACHE_DIR=$(CURDIR)/build/lowest-kernels $(MAKE) test VENV=.venv-lowest CONSTRAINTS=build/lowest.txt
+	NUMBA_CACHE_DIR=$(CURDIR)/build/lowest-kernels $(MAKE) test test-nightly VENV=.venv-lowest CONSTRAINTS=build/lowest.txt
 
 build/lowest.txt: pyproject.toml
 	@mkdir -p build

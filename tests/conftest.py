@@ -25,6 +25,18 @@ MARKERS_OF_FIXTURES = {
     "server": {"service", "closed", "server", "slots"},
     "browser": {"browser"},
 }
+# `make test-nightly` runs what lies here, so that `make test` stays short enough to be run before each commit.
+NIGHTLY = (
+    "tests/deploy/",
+    "tests/docs/test_documented_commands.py",
+    "tests/docs/test_notebooks.py",
+    "tests/service/test_fuzz.py",
+    "tests/studies/commands/",
+    "tests/test_benchmarks.py",
+    "tests/test_run_benchmarks.py",
+    "tests/workers/queue/promises/",
+)
+FIRST_PAGES = ("[README.md]", "[docs/quick-start.md]")  # whose commands every newcomer runs
 # Why a test may be skipped on a machine that has all that CI installs: any other skip fails `--unexpected-skips-fail`.
 EXPECTED_SKIPS = (
     r"torch finds none",
@@ -61,6 +73,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         for marker, names in MARKERS_OF_FIXTURES.items():
             if fixtures & names:
                 item.add_marker(marker)
+        if item.nodeid.startswith(NIGHTLY) and not item.nodeid.endswith(FIRST_PAGES):
+            item.add_marker("nightly")
 
 
 def _skips(config: pytest.Config) -> tuple[int, Counter[str]]:
@@ -77,7 +91,21 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
+def _write_time_by_file(terminalreporter: pytest.TerminalReporter) -> None:
+    """The files that took longest: what to shorten first."""
+    seconds: Counter[str] = Counter()
+    for reports in terminalreporter.stats.values():
+        for report in reports:
+            if isinstance(report, pytest.TestReport):
+                seconds[report.nodeid.partition("::")[0]] += report.duration  # type: ignore[assignment]
+    terminalreporter.section("seconds by file")
+    for file, spent in seconds.most_common(terminalreporter.config.getoption("durations")):
+        terminalreporter.write_line(f"{spent:8.1f} {file}")
+
+
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    if config.getoption("durations"):
+        _write_time_by_file(terminalreporter)
     skipped, unexpected = _skips(config)
     if skipped:
         terminalreporter.write_line(f"{skipped} skipped, {unexpected.total()} of them unexpectedly")
