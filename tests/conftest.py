@@ -47,6 +47,7 @@ EXPECTED_SKIPS = (
     r"npm cannot install",
     r"no zip program writes",
     r"promtool is not installed",
+    r"nginx is not installed",
     r"all was sent before the signal came",
     r"the Kubernetes manifests are not rendered",
     r"Slurm is run by make slurm-check",

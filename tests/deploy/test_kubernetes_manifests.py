@@ -6,12 +6,14 @@ import json
 import re
 import shutil
 from collections.abc import Iterator, Mapping
+from ipaddress import ip_network
 from pathlib import Path
 
 import jsonschema
 import kubernetes_validate
 import pytest
 import yaml
+from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
 from tests.deploy.keda_schemas import BY_KIND
 from tests.deploy.manifests import (
@@ -26,6 +28,7 @@ from tests.deploy.manifests import (
     rendered,
 )
 from tests.docs.forms_of_commands import command_context
+from workers.process.watchdog import STUCK_S
 from workers.settings.settings import Settings
 
 PAGE = (ROOT / "docs/kubernetes.md").read_text("utf-8")
@@ -123,6 +126,21 @@ def test_a_worker_is_ready_as_its_image_says(overlay: str):
     assert container(worker)["readinessProbe"]["exec"]["command"] == json.loads(check)
 
 
+@each_overlay
+def test_what_goes_on_for_ever_is_restarted_once_its_loop_stands_still(overlay: str):
+    """But neither at its start nor where it was frozen for less than the process itself allows."""
+    pods = dict(pod_templates(rendered(overlay)))
+    for name in ("biresnerf-dispatcher", "biresnerf-worker"):
+        one = container(pods[name])
+        probe = one["livenessProbe"]
+        (check,) = re.findall(
+            r"HEALTHCHECK [^\[]*CMD (\[.*\])", (ROOT / "Dockerfile").read_text().replace("\\\n", " ")
+        )
+        assert probe["exec"]["command"] == [*json.loads(check), "live"], name
+        assert probe["periodSeconds"] * (probe["failureThreshold"] - 1) >= STUCK_S, name
+    assert "httpGet" in container(pods["biresnerf-api"])["livenessProbe"]
+
+
 def variables(template: Manifest, manifests: tuple[Manifest, ...]) -> Mapping[str, str]:
     """What the container finds in its environment; values that the cluster fills in are empty."""
     one = container(template)
@@ -211,6 +229,39 @@ def test_nobody_is_reached_and_reaches_out_but_as_said(overlay: str):
 
 
 @each_overlay
+def test_addresses_within_the_cluster_are_reached_where_an_overlay_names_them_alone(overlay: str):
+    """Not the cluster's API, nor what else listens in kube-system or in a private network."""
+    policy = only(rendered(overlay), "NetworkPolicy", "names-database-and-store")
+    names, database, store = policy["spec"]["egress"]
+    (pods,) = names["to"]
+    assert pods["namespaceSelector"]["matchLabels"] == {"kubernetes.io/metadata.name": "kube-system"}
+    assert pods["podSelector"]["matchLabels"] == {"k8s-app": "kube-dns"}
+    assert {port["port"] for port in names["ports"]} == {53}
+    for rule, port in ((database, 5432), (store, 443)):
+        assert [item["port"] for item in rule["ports"]] == [port]
+        # Addresses for documentation, RFC 5737: they lead nowhere.
+        assert all(
+            ip_network(to["ipBlock"]["cidr"]).subnet_of(ip_network("192.0.2.0/24")) for to in rule["to"]
+        )
+
+
+@pytest.mark.anyio
+async def test_who_a_client_is_says_the_proxy_and_not_the_client():
+    """Of X-Forwarded-For the last address that is no proxy's counts: what stands before it, the client sent."""
+    trusted = only(rendered("cpu"), "ConfigMap", "biresnerf-settings")["data"]["FORWARDED_ALLOW_IPS"]
+    seen = []
+
+    async def app(scope, receive, send):
+        seen.append((scope["client"][0], scope["scheme"]))
+
+    for peer in ("10.42.0.3", "100.64.3.2", "203.0.113.4"):
+        headers = [(b"x-forwarded-for", b"6.6.6.6, 198.51.100.7"), (b"x-forwarded-proto", b"https")]
+        scope = {"type": "http", "client": (peer, 1), "scheme": "http", "headers": headers}
+        await ProxyHeadersMiddleware(app, trusted)(scope, None, None)
+    assert seen == [("198.51.100.7", "https")] * 2 + [("203.0.113.4", "http")]
+
+
+@each_overlay
 def test_every_container_runs_a_command_of_ours_and_a_worker_has_time_to_stop(overlay: str):
     for name, template in pod_templates(rendered(overlay)):
         program, *words = container(template)["args"]
@@ -250,3 +301,8 @@ def test_the_overlay_of_the_page_renders_with_the_readers_names(tmp_path: Path):
     settings = only(found, "ConfigMap", "biresnerf-settings")["data"]
     assert settings["BIRESNERF_STORAGE_URL"] == "s3://poses/production"
     assert settings["BIRESNERF_AUTH"] == "required"
+    _, database, store = only(found, "NetworkPolicy", "names-database-and-store")["spec"]["egress"]
+    assert [to["ipBlock"]["cidr"] for rule in (database, store) for to in rule["to"]] == [
+        "10.0.8.5/32",
+        "10.0.9.0/28",
+    ]

@@ -18,6 +18,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from types import ModuleType
 
 import httpx
 import psycopg
@@ -109,12 +110,20 @@ def waiting(scaler: psycopg.Connection, overlay: str = "cpu") -> int:
     return int(scaler.execute(trigger["metadata"]["query"].encode()).fetchone()[0])
 
 
-def is_ready(scratch: Path) -> bool:
-    """The worker's readiness probe, which the container runs as deploy/health.py."""
+def health() -> ModuleType:
+    """deploy/health.py, which the container runs for its probes."""
     spec = importlib.util.spec_from_file_location("health", ROOT / "deploy/health.py")
-    health = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(health)
-    return health.trouble_of_worker(scratch / "slots") == ""
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def is_ready(scratch: Path) -> bool:
+    return health().trouble_of_worker(scratch / "slots") == ""
+
+
+def is_alive(scratch: Path, silence_s: float) -> bool:
+    return health().trouble_of_loop(scratch / "beats", silence_s) == ""
 
 
 async def until(holds, what: str) -> None:
@@ -153,6 +162,7 @@ async def test_an_evicted_worker_ends_in_time_and_the_next_one_goes_on_from_its_
     evicted, scratch = cluster.start(worker)
     await counting.until(lambda job: job.progress.step >= 10)
     assert is_ready(scratch)
+    assert is_alive(scratch, 60.0)
     assert waiting(scaler) == 0
     evicted.terminate()
     grace_s = worker["spec"]["terminationGracePeriodSeconds"]
@@ -200,8 +210,14 @@ async def test_the_other_pods_end_as_their_manifests_expect(cluster: Cluster, tm
     pods = dict(pod_templates(rendered("cpu")))
     migrate, _ = cluster.start(pods["biresnerf-migrate"])
     assert await asyncio.to_thread(migrate.wait, PATIENCE_S) == 0
-    dispatcher, _ = cluster.start(pods["biresnerf-dispatcher"])
+    dispatcher, scratch = cluster.start(pods["biresnerf-dispatcher"])
     await until(lambda: "dispatcher is ready" in (tmp_path / "pod1.log").read_text(), "it is ready")
+    # Two beats late is frozen, for a test.
+    assert is_alive(scratch, 12.0)
+    dispatcher.send_signal(signal.SIGSTOP)
+    await until(lambda: not is_alive(scratch, 12.0), "nobody takes a frozen one for alive")
+    dispatcher.send_signal(signal.SIGCONT)
+    await until(lambda: is_alive(scratch, 12.0), "it goes on")
     dispatcher.terminate()
     grace_s = pods["biresnerf-dispatcher"]["spec"]["terminationGracePeriodSeconds"]
     assert await asyncio.to_thread(dispatcher.wait, grace_s) == 0

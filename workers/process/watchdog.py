@@ -10,6 +10,7 @@ import os
 import sys
 import threading
 from collections.abc import AsyncIterator, Awaitable, Callable
+from pathlib import Path
 
 from workers.process.exit_status import ExitStatus
 from workers.settings.errors import SetupError
@@ -24,9 +25,13 @@ LOOKS = 10
 
 
 @contextlib.asynccontextmanager
-async def end_if_hung(stuck_s: float = STUCK_S) -> AsyncIterator[None]:
-    """While inside, the process ends with `ExitStatus.STUCK` where this event loop does nothing for ``stuck_s``."""
-    watchdog = _Watchdog(stuck_s / LOOKS)
+async def end_if_hung(stuck_s: float = STUCK_S, beat: Path | None = None) -> AsyncIterator[None]:
+    """While inside, the process ends with `ExitStatus.STUCK` where this event loop does nothing for ``stuck_s``.
+
+    The loop touches the file ``beat`` all the while: deploy/health.py goes by its age, where a library that keeps
+    Python's lock holds up our thread as well.
+    """
+    watchdog = _Watchdog(stuck_s / LOOKS, beat)
     watchdog.start()
     ticking = asyncio.create_task(watchdog.tick())
     try:
@@ -58,7 +63,7 @@ def run_process(name: str, work: Callable[[Settings], Awaitable[ExitStatus]]) ->
     set_up_logging(name, settings)
 
     async def watched() -> ExitStatus:
-        async with end_if_hung():
+        async with end_if_hung(beat=settings.data_dir / "beats" / f"{os.uname().nodename}.{name}"):
             return await work(settings)
 
     try:
@@ -69,8 +74,9 @@ def run_process(name: str, work: Callable[[Settings], Awaitable[ExitStatus]]) ->
 
 
 class _Watchdog(threading.Thread):
-    def __init__(self, period_s: float) -> None:
+    def __init__(self, period_s: float, beat: Path | None) -> None:
         super().__init__(daemon=True, name="watchdog")
+        self._beat = beat
         self.end = threading.Event()
         self._period_s, self._ticks = period_s, 0
 
@@ -78,7 +84,14 @@ class _Watchdog(threading.Thread):
         """Show that the loop goes on."""
         while True:
             self._ticks += 1
+            self._show()
             await asyncio.sleep(self._period_s / 2)
+
+    def _show(self) -> None:
+        if self._beat is not None:
+            with contextlib.suppress(OSError):  # a full disk is no reason to end
+                self._beat.parent.mkdir(parents=True, exist_ok=True)
+                self._beat.touch()
 
     def run(self) -> None:
         """Check until `end` is set."""

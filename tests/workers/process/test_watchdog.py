@@ -7,16 +7,18 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 from tests.workers.conftest import ROOT
 from workers.process.exit_status import ExitStatus
 
 PROGRAM = """
 import asyncio, sys, time
+from pathlib import Path
 from workers.process.watchdog import end_if_hung
 
 async def main():
-    async with end_if_hung(1.0):
+    async with end_if_hung(1.0, Path(sys.argv[2])):
         print("ready", flush=True)
         if sys.argv[1] == "hangs":
             time.sleep(60)
@@ -26,9 +28,9 @@ asyncio.run(main())
 """
 
 
-def start(how: str) -> subprocess.Popen[str]:
+def start(how: str, beat: Path) -> subprocess.Popen[str]:
     process = subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, how],
+        [sys.executable, "-c", PROGRAM, how, str(beat)],
         cwd=ROOT,
         text=True,
         stdout=subprocess.PIPE,
@@ -39,17 +41,21 @@ def start(how: str) -> subprocess.Popen[str]:
     return process
 
 
-def test_a_loop_that_stands_still_ends_the_process_and_says_where():
-    process = start("hangs")
+def test_a_loop_that_stands_still_ends_the_process_and_says_where(tmp_path: Path):
+    process = start("hangs", tmp_path / "beat")
     _, said = process.communicate(timeout=40)
     assert process.returncode == ExitStatus.STUCK
     assert "in main" in said
 
 
-def test_a_process_that_was_frozen_goes_on():
-    process = start("works")
+def test_a_process_that_was_frozen_goes_on(tmp_path: Path):
+    beat = tmp_path / "beats/of-it"
+    process = start("works", beat)
     os.kill(process.pid, signal.SIGSTOP)
+    frozen = beat.stat().st_mtime
     time.sleep(2.5)
+    assert beat.stat().st_mtime == frozen
     os.kill(process.pid, signal.SIGCONT)
     process.communicate(timeout=40)
     assert process.returncode == 0
+    assert beat.stat().st_mtime > frozen + 2.0, "it shows whoever looks from outside that it goes on"
