@@ -25,7 +25,14 @@ from biresnerf.refinement.stages.two_stages import TwoStages
 from biresnerf.refinement.start.refined_poses import RefinedPoses
 from biresnerf.refinement.verdict import image_flags
 from biresnerf.refinement.verdict.pose_evidence import compare_on_matches, errors_px, working_share
-from biresnerf.refinement.verdict.verdict import MEASURABLE_PX, Findings, decide, failed_checks, frame_doubt
+from biresnerf.refinement.verdict.verdict import (
+    FAR_DEG,
+    MEASURABLE_PX,
+    Findings,
+    decide,
+    failed_checks,
+    frame_doubt,
+)
 from biresnerf.refinement.views.compare_rigs import (
     BeforeAfter,
     Effort,
@@ -174,6 +181,7 @@ def compare_without_training(scene: Scene, refined: RefinedPoses, lost: int) -> 
         grounded=grounded,
         working_share=working_share(before, images),
         out_of_frame=frame_doubt(turned, shifted, spread) if grounded and not failed else "",
+        turned_far=bool(np.median(turned) > FAR_DEG),
         faults=tuple(map(str, dataset.faults)),
         offset=dataset.body_offset is not None,
         by_gimbal=sum(frame.pose_source == "gimbal" for frame in dataset.frames) > len(dataset) / 2,

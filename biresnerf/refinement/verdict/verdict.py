@@ -39,6 +39,7 @@ class Findings:
         faults: sentences on what failed on our side.
         working_share: working size over the full size that `epipolar` is measured at.
         out_of_frame: a sentence if the refined poses fit the input's frame only roughly, else empty.
+        turned_far: whether the median camera ends turned by more than `FAR_DEG`.
         compared_with: where the input's poses come from.
         grounded: whether the input's poses are given ones or come from matches, and are not mere guesses.
         offset: whether an offset that all given poses shared was taken back.
@@ -54,6 +55,7 @@ class Findings:
     compared_with: Literal["given", "seeded", "mixed"]
     grounded: bool
     out_of_frame: str = ""
+    turned_far: bool = False
     faults: tuple[str, ...] = ()
     working_share: float = 1.0
     offset: bool = False
@@ -129,7 +131,9 @@ def _judge(f: Findings) -> tuple[VerdictName, str]:
     if f.moved_px < MEASURABLE_PX:
         return "unchanged", f"The poses moved by less than can be measured (below {MEASURABLE_PX:g} px)."
     speaks_for, speaks_against = _for(f), _against(f)
-    if f.out_of_frame and (speaks_against or not {VIEWS, MATCHES} <= set(speaks_for)):
+    # Positions may be off by more than a narrow rig is wide. Rotations that far off are another arrangement.
+    needed = {VIEWS, MATCHES} if f.turned_far else {MATCHES}
+    if f.out_of_frame and (speaks_against or not needed <= set(speaks_for)):
         return "failed_check", f.out_of_frame
     if speaks_for and speaks_against:
         return (
