@@ -59,9 +59,9 @@ async def make_backup(settings: Settings, url: str, folder: Path) -> BackupIndex
             f"{folder} holds the backup of another installation. Restore it, or name another.",
         )
     saved: dict[str, SavedFile] = {}
-    for found in await _stored(store):
+    for file in await _stored(store):
         with contextlib.suppress(NotFound):  # deleted after it was listed
-            saved[found.key] = await _save(store, found, folder, before.get(found.key))
+            saved[file.key] = await _save(store, file, folder, before.get(file.key))
     async with await psycopg.AsyncConnection.connect(url, connect_timeout=10) as connection:
         await connection.set_isolation_level(psycopg.IsolationLevel.REPEATABLE_READ)
         ((moment,),) = await _rows(connection, "SELECT pg_export_snapshot()")
