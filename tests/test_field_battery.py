@@ -12,7 +12,8 @@ import pytest
 from PIL import Image
 
 from benchmarks.field.colmap_child import epipolar
-from benchmarks.field.inputs import gps_residual, metres_from, photos_alone, with_poses
+from benchmarks.field.inputs import gps_residual, lens, metres_from, photos_alone, with_poses
+from benchmarks.field.run_set import _true_frames
 from benchmarks.field.sets import FieldSet, lay_out, read_sets
 from benchmarks.field.table import table
 from biresnerf.data.formats.read_dataset import read_dataset
@@ -138,3 +139,33 @@ def test_the_table_has_what_failed_too():
         "| x: a tree | 8 of 40 x 30 | 8 of 8; 0.41 px; 2.3 m; kept input | failed: last line "
         "| 13.0° -> 0.08°, own frame 0.10°; 0.41 px; 2.3 m; kept input | 5, 9 | -, 1 |"
     )
+
+
+def test_the_truth_is_colmaps_richest_model_whose_lenses_see_every_pixel():
+    def model(count: int, **lens: Any) -> dict[str, Any]:
+        pose = np.eye(4).tolist()
+        return {
+            "frames": [
+                {"name": f"{i}.jpg", "world_from_cam": pose, "lens": LENS | lens} for i in range(count)
+            ]
+        }
+
+    simple = {"model": "SIMPLE_RADIAL", "params": [60.0, 31.0, 25.0, 0.01]}
+    folding = {"params": [60.0, 61.0, 31.0, 25.0, -2.0, 0.0, 0.0, 0.0]}
+    good, default, few = model(4), model(5, **simple), model(2)
+    assert _true_frames({"reference": good, "peer": default}) == good["frames"]
+    assert _true_frames({"reference": model(4, **folding), "peer": default}) == default["frames"]
+    assert _true_frames({"reference": few, "peer": default}) == default["frames"]
+    assert _true_frames({"reference": few, "peer": model(5, **folding)}) == []
+    assert lens(default["frames"][0]) == {
+        "w": 64,
+        "h": 48,
+        "fl_x": 60.0,
+        "fl_y": 60.0,
+        "cx": 31.0,
+        "cy": 25.0,
+        "k1": 0.01,
+        "k2": 0.0,
+        "p1": 0.0,
+        "p2": 0.0,
+    }

@@ -147,7 +147,7 @@ def measure(request: dict[str, Any]) -> dict[str, Any]:
         distances.append(focal * epipolar(between.rotation.matrix(), between.translation, *rays))
     if not distances:
         return {"epipolar_px": None, "close": None, "pairs": 0}
-    off = np.concatenate(distances)
+    off = np.nan_to_num(np.concatenate(distances), nan=np.inf)  # COLMAP's lenses do not see all pixels
     return {
         "epipolar_px": float(np.median(off)),
         "close": float((off < CLOSE_PX).mean()),

@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.photos.geotags import read_geotag
+from biresnerf.geometry.camera.camera_models import Camera
+from biresnerf.geometry.camera.lens import lens_problem
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.similarity import align_robust
 
@@ -47,8 +49,21 @@ def with_poses(folder: Path, frames: list[dict[str, Any]], *, noise: float) -> P
 def lens(frame: dict[str, Any]) -> dict[str, Any]:
     """An OPENCV lens in a transforms.json's words."""
     keys = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
+    full = _camera(frame).full()
+    params = (full.fx, full.fy, full.cx, full.cy, full.k1, full.k2, full.p1, full.p2)
+    return {"w": frame["lens"]["width"], "h": frame["lens"]["height"], **dict(zip(keys, params, strict=True))}
+
+
+def lenses_are_real(frames: list[dict[str, Any]]) -> bool:
+    """Whether every pixel has a viewing ray: of few photos COLMAP finds lenses that fold."""
+    cameras = (_camera(frame) for frame in frames)
+    return all(lens_problem(c.full(), c.width, c.height) is None for c in cameras)
+
+
+def _camera(frame: dict[str, Any]) -> Camera:
+    """Of COLMAP's SIMPLE_RADIAL or OPENCV."""
     found = frame["lens"]
-    return {"w": found["width"], "h": found["height"], **dict(zip(keys, found["params"], strict=True))}
+    return Camera(found["model"], found["width"], found["height"], tuple(found["params"]))
 
 
 def gps_places(source: Path, names: tuple[str, ...]) -> dict[str, Array]:

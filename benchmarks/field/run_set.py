@@ -15,7 +15,15 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from benchmarks.field.inputs import NOISE, Array, gps_places, gps_residual, photos_alone, with_poses
+from benchmarks.field.inputs import (
+    NOISE,
+    Array,
+    gps_places,
+    gps_residual,
+    lenses_are_real,
+    photos_alone,
+    with_poses,
+)
 from benchmarks.field.sets import FieldSet, lay_out
 from biresnerf.data.formats.read_dataset import read_poses
 from biresnerf.geometry.pose_error import pose_error
@@ -52,8 +60,8 @@ def run_set(field_set: FieldSet, asked: Asked) -> Row:
     names = field_set.photos[: asked.photos]
     colmap = _placed_by_colmap(source, names, work / "colmap")
     places = gps_places(source, names)
-    reference = colmap.get("reference", {})
-    truth = poses_of(reference.get("frames", []))
+    frames = _true_frames(colmap)
+    truth = poses_of(frames)
     judge = Judge(truth, places, work / "colmap")
     with Image.open(source / names[0]) as first:
         size = first.size
@@ -71,7 +79,7 @@ def run_set(field_set: FieldSet, asked: Asked) -> Row:
     given = {"alone": photos_alone(source, names, work / "alone")}
     if truth:
         folder = photos_alone(source, names, work / "noisy")
-        given["noisy"] = with_poses(folder, reference["frames"], noise=NOISE)
+        given["noisy"] = with_poses(folder, frames, noise=NOISE)
         before = read_poses(folder / "transforms.json")
         row["given"] = judge.of({Path(name).name: pose for name, pose in before.items()}, None)
     if field_set.owner_poses:
@@ -130,6 +138,15 @@ def child(step: str, work: Path, **request: Any) -> Row:
         return {"error": f"COLMAP ended with {code}"}
     found: Row = json.loads(answer.read_text("utf-8"))
     return found
+
+
+def _true_frames(colmap: Row) -> list[Row]:
+    """Those of COLMAP's model with richer lenses; else of its default one; none where neither can be the truth."""
+    for name in ("reference", "peer"):
+        frames: list[Row] = colmap.get(name, {}).get("frames", [])
+        if len(frames) > 2 and lenses_are_real(frames):
+            return frames
+    return []
 
 
 def _placed_by_colmap(source: Path, names: tuple[str, ...], work: Path) -> Row:
