@@ -1,4 +1,7 @@
-"""Brings a database up to date: the queue's schema and our numbered files, in one transaction."""
+"""Brings a database up to date: the queue's schema and our numbered files, in one transaction.
+
+Files lie in a folder for each release. Those of a release that is out never change: the next one adds its own.
+"""
 
 from __future__ import annotations
 
@@ -58,9 +61,11 @@ def step_names() -> list[str]:
 
 def _our_steps() -> list[tuple[str, str]]:
     folder = resources.files("workers.database").joinpath("migrations")
-    files = sorted(folder.iterdir(), key=lambda file: file.name)
+    releases = sorted(folder.iterdir(), key=lambda release: [int(part) for part in release.name.split(".")])
     return [
-        (file.name.removesuffix(".sql"), file.read_text()) for file in files if file.name.endswith(".sql")
+        (f"{release.name}/{file.name.removesuffix('.sql')}", file.read_text())
+        for release in releases
+        for file in sorted(release.iterdir(), key=lambda file: file.name)
     ]
 
 

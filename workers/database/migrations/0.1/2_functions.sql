@@ -1,4 +1,4 @@
--- Functions and triggers on the tables of 001_tables.sql.
+-- Functions and triggers of release 0.1, on the tables of 1_tables.sql.
 
 -- Appends to a job's history. The row lock of the job makes seq gapless and in commit order.
 CREATE FUNCTION add_job_event(_job_id text, _type text, _data jsonb) RETURNS bigint LANGUAGE plpgsql AS $$
@@ -32,6 +32,8 @@ $$;
 CREATE TRIGGER touch BEFORE UPDATE ON datasets FOR EACH ROW
     WHEN (NEW.revision <> OLD.revision) EXECUTE FUNCTION touch();
 
+-- Exports run beside refinements and have a queue of their own: a tenant's limit neither counts nor holds them, and
+-- their turns are counted among themselves.
 -- Self-clocked fair queueing. A job's turn is the cost of its tenant's jobs before it, divided by the tenant's weight,
 -- counted from the clock; the clock stands at the turn of the job that started last. So tenants that wait at the
 -- same time take turns by weight, and capacity used while no other tenant waited is not held against anyone.
@@ -53,10 +55,12 @@ BEGIN
     -- The work of a job with the preset balanced (8000 steps) is 1; a job is never for nothing.
     _cost := least(10, greatest(0.1, coalesce(NEW.planned_steps, 800) / 8000.0));
     NEW.turn := _cost / _tenant.weight + greatest(_clock, (
-        SELECT max(turn) FROM jobs WHERE tenant = NEW.tenant AND priority = NEW.priority AND state = 'queued'));
+        SELECT max(turn) FROM jobs WHERE tenant = NEW.tenant AND priority = NEW.priority AND kind = NEW.kind
+            AND state = 'queued'));
     NEW.queue_order := -700000000 * NEW.priority + least(699999999, 100 * NEW.turn)::int;
-    NEW.held := _tenant.max_running > 0 AND _tenant.max_running <= (
-        SELECT count(*) FROM jobs WHERE tenant = NEW.tenant AND NOT held AND state IN ('queued', 'running'));
+    NEW.held := NEW.kind = 'refine' AND _tenant.max_running > 0 AND _tenant.max_running <= (
+        SELECT count(*) FROM jobs
+            WHERE tenant = NEW.tenant AND kind = 'refine' AND NOT held AND state IN ('queued', 'running'));
     RETURN NEW;
 END;
 $$;
@@ -86,7 +90,7 @@ BEGIN
     PERFORM 1 FROM tenants WHERE id = _tenant FOR NO KEY UPDATE;
     SELECT max_running INTO STRICT _limit FROM tenant_limits WHERE id = _tenant;
     SELECT CASE WHEN _limit = 0 THEN 2147483647 ELSE greatest(0, _limit - count(*)) END INTO _room
-        FROM jobs WHERE tenant = _tenant AND NOT held AND state IN ('queued', 'running');
+        FROM jobs WHERE tenant = _tenant AND kind = 'refine' AND NOT held AND state IN ('queued', 'running');
     FOR _job IN
         -- One that is being cancelled is passed over.
         SELECT id, queue_id FROM jobs WHERE tenant = _tenant AND held AND state = 'queued'
@@ -99,30 +103,46 @@ BEGIN
     RETURN _offered;
 END;
 $$;
+-- A submission that counts a job which is just ending is held, and the end does not see it. So, where there is a limit,
+-- an end comes before the submission or after it.
 CREATE FUNCTION make_room() RETURNS trigger LANGUAGE plpgsql AS $$
 BEGIN
+    IF (SELECT max_running FROM tenant_limits WHERE id = NEW.tenant) > 0 THEN
+        PERFORM 1 FROM tenants WHERE id = NEW.tenant FOR NO KEY UPDATE;
+    END IF;
     PERFORM offer_held(NEW.tenant);
     RETURN NULL;
 END;
 $$;
-CREATE TRIGGER make_room AFTER UPDATE OF state ON jobs FOR EACH ROW
+-- Locked last, once all ends are written: who ends several jobs in one transaction (a janitor) would lock the tenant at
+-- the first, and then wait for the next job, whose worker holds it and waits for the tenant.
+CREATE CONSTRAINT TRIGGER make_room AFTER UPDATE OF state ON jobs DEFERRABLE INITIALLY DEFERRED FOR EACH ROW
     WHEN (OLD.state IN ('queued', 'running') AND NEW.state NOT IN ('queued', 'running'))
     EXECUTE FUNCTION make_room();
 
 -- What a tenant has stored: files of datasets, results, and of uploads what their datasets do not count yet.
 CREATE FUNCTION count_stored_bytes() RETURNS trigger LANGUAGE plpgsql AS $$
 BEGIN
-    IF TG_OP <> 'INSERT' THEN
-        UPDATE datasets SET stored_bytes = stored_bytes - OLD.size WHERE id = OLD.dataset_id;
-    END IF;
-    IF TG_OP <> 'DELETE' THEN
-        UPDATE datasets SET stored_bytes = stored_bytes + NEW.size WHERE id = NEW.dataset_id;
-    END IF;
+    UPDATE datasets SET stored_bytes = stored_bytes - OLD.size WHERE id = OLD.dataset_id;
+    UPDATE datasets SET stored_bytes = stored_bytes + NEW.size WHERE id = NEW.dataset_id;
     RETURN NULL;
 END;
 $$;
-CREATE TRIGGER count_stored_bytes AFTER INSERT OR DELETE OR UPDATE OF size, dataset_id ON dataset_files
+CREATE TRIGGER count_stored_bytes AFTER UPDATE OF size, dataset_id ON dataset_files
     FOR EACH ROW EXECUTE FUNCTION count_stored_bytes();
+-- Counted once for all files of a statement: an archive records thousands at once.
+CREATE FUNCTION count_changed_bytes() RETURNS trigger LANGUAGE plpgsql AS $$
+BEGIN
+    UPDATE datasets SET stored_bytes = stored_bytes + CASE TG_OP WHEN 'INSERT' THEN total.bytes ELSE -total.bytes END
+        FROM (SELECT dataset_id, sum(size)::bigint AS bytes FROM changed GROUP BY dataset_id) AS total
+        WHERE id = total.dataset_id;
+    RETURN NULL;
+END;
+$$;
+CREATE TRIGGER count_added_bytes AFTER INSERT ON dataset_files REFERENCING NEW TABLE AS changed
+    FOR EACH STATEMENT EXECUTE FUNCTION count_changed_bytes();
+CREATE TRIGGER count_deleted_bytes AFTER DELETE ON dataset_files REFERENCING OLD TABLE AS changed
+    FOR EACH STATEMENT EXECUTE FUNCTION count_changed_bytes();
 CREATE FUNCTION stored_bytes_of(_tenant text) RETURNS bigint LANGUAGE sql AS $$
     SELECT (SELECT coalesce(sum(stored_bytes), 0) FROM datasets WHERE tenant = _tenant)::bigint
         + (SELECT coalesce(sum(stored_bytes), 0) FROM jobs WHERE tenant = _tenant)::bigint

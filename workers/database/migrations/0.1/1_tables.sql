@@ -1,5 +1,5 @@
--- The first schema: tables and indexes. Their functions and triggers follow in 002_functions.sql; the queue's own
--- tables, views and functions come first, from workers/database/job_queue.py.
+-- The schema of release 0.1: tables, views and indexes. Their functions and triggers follow in 2_functions.sql; the
+-- queue's own tables, views and functions come first, from workers/database/job_queue.py.
 
 -- Tenants, and the keys that identify them. `local` is the tenant of whoever runs the machine. A limit of 0 is no
 -- limit; where a limit is null, tenant_defaults holds.
@@ -44,7 +44,8 @@ CREATE TABLE api_keys (
     last_used_at timestamptz
 );
 
--- `check_token`, `check_until`: who checks the dataset, and until when without a sign of life.
+-- `check_token`, `check_until`: who checks the dataset, and until when without a sign of life. `check_losses`: how many
+-- processes were lost while they checked it: one that takes them down is not checked for ever.
 -- `expires_at` is kept up to date by the dispatcher, which alone deletes by it; null is never.
 CREATE TABLE datasets (
     id text PRIMARY KEY,
@@ -58,6 +59,7 @@ CREATE TABLE datasets (
     stored_bytes bigint NOT NULL DEFAULT 0,
     check_token uuid,
     check_until timestamptz,
+    check_losses int NOT NULL DEFAULT 0,
     created_at timestamptz NOT NULL DEFAULT clock_timestamp(),
     touched_at timestamptz NOT NULL DEFAULT clock_timestamp(),
     expires_at timestamptz,
@@ -66,6 +68,9 @@ CREATE TABLE datasets (
 CREATE INDEX datasets_newest ON datasets (created_at DESC, id DESC);
 CREATE INDEX datasets_of_tenant ON datasets (tenant, created_at DESC, id DESC);
 CREATE INDEX datasets_unfinished ON datasets (created_at) WHERE state = 'finalizing';
+CREATE INDEX datasets_of_state ON datasets (state);
+CREATE INDEX datasets_touched ON datasets (touched_at);
+CREATE INDEX datasets_expiry ON datasets (expires_at) WHERE expires_at IS NOT NULL;
 
 CREATE TABLE dataset_files (
     dataset_id text NOT NULL REFERENCES datasets ON DELETE CASCADE,
@@ -77,6 +82,14 @@ CREATE TABLE dataset_files (
     PRIMARY KEY (dataset_id, path)
 );
 CREATE INDEX dataset_files_content ON dataset_files (sha256, size);
+
+-- Who brings an archive into a dataset, and until when without a sign of life: closing the dataset waits.
+CREATE TABLE dataset_imports (
+    token uuid PRIMARY KEY,
+    dataset_id text NOT NULL REFERENCES datasets ON DELETE CASCADE,
+    live_until timestamptz NOT NULL
+);
+CREATE INDEX dataset_imports_dataset ON dataset_imports (dataset_id);
 
 -- Uploads under way. Their bytes lie below `folder` in the file store, which goes to the trash with the row.
 -- `take_token`, `take_until`: who brings a received upload into its dataset, and until when without a sign of life.
@@ -120,6 +133,10 @@ $$;
 -- running as it may; the queue does not offer this one until one of those ends. `trace`: the W3C traceparent of the
 -- submission, which attempts join. An export of a result is a job below its `parent`. `options`: as requested;
 -- `resolved_options`: as the latest attempt used them; `planned_steps`: the cost of the job, which decides its turn.
+-- `crashes`: attempts that crashed since the last checkpoint; `losses`: that lost their worker, which is seldom the
+-- job's fault and counts apart; `setback`: why the last attempt ended before its job did. `slot_kind`: of the slot that
+-- runs the job, or ran it last. `fixed_from`: the job whose result this one joins its photos to. (No reference: what
+-- was joined stays when the other is deleted.)
 -- fillfactor leaves space in each page, so that progress updates stay HOT (no index writes).
 CREATE TABLE jobs (
     id text PRIMARY KEY,
@@ -129,6 +146,7 @@ CREATE TABLE jobs (
     parent text REFERENCES jobs ON DELETE CASCADE,
     forked_from text,
     forked_stage text,
+    fixed_from text,
     state text NOT NULL DEFAULT 'queued'
         CHECK (state IN ('queued', 'running', 'succeeded', 'failed', 'cancelled', 'expired')),
     options jsonb NOT NULL,
@@ -144,6 +162,10 @@ CREATE TABLE jobs (
     held boolean NOT NULL DEFAULT false,
     queue_id bigint,
     attempt int NOT NULL DEFAULT 0,
+    crashes int NOT NULL DEFAULT 0,
+    losses int NOT NULL DEFAULT 0,
+    setback text CHECK (setback IN ('worker_lost', 'killed', 'error', 'disk_full', 'store_away')),
+    slot_kind text,
     run_token uuid,
     cancel_requested boolean NOT NULL DEFAULT false,
     keep_partial boolean NOT NULL DEFAULT false,
@@ -185,6 +207,19 @@ CREATE INDEX jobs_held ON jobs (tenant, queue_order, queue_id) WHERE held AND st
 CREATE INDEX jobs_offered ON jobs (tenant) WHERE NOT held AND state IN ('queued', 'running');
 CREATE INDEX jobs_expiry ON jobs (expires_at) WHERE expires_at IS NOT NULL;
 CREATE INDEX jobs_over ON jobs (finished_at) WHERE finished_at IS NOT NULL;
+CREATE INDEX jobs_fixed ON jobs (fixed_from) WHERE fixed_from IS NOT NULL;
+-- Each upload and submission sums what a tenant stores, and metrics count jobs by state: with 100,000 jobs 213 and
+-- 187 ms without these two indexes, 9 ms each with them.
+CREATE INDEX jobs_stored ON jobs (tenant) INCLUDE (stored_bytes);
+CREATE INDEX jobs_of_state ON jobs (state);
+-- So that rounds of upkeep read what changed and lists read what they show, not all jobs that ever were: measured by
+-- `python -m benchmarks.service.full_tables` (docs/scaling.md).
+CREATE INDEX jobs_undated ON jobs (finished_at)
+    WHERE finished_at IS NOT NULL AND expires_at IS NULL AND state <> 'expired';
+CREATE INDEX jobs_with_key ON jobs (finished_at) WHERE idempotency_key IS NOT NULL;
+CREATE INDEX jobs_forked ON jobs (forked_from) WHERE forked_from IS NOT NULL;
+CREATE INDEX jobs_of_tenant_in_state ON jobs (tenant, state, created_at DESC, id DESC);
+CREATE INDEX jobs_labels ON jobs USING gin (labels jsonb_path_ops);
 -- Of two exports of one result in the same formats, the second is the first.
 CREATE UNIQUE INDEX jobs_one_export ON jobs (parent, fingerprint)
     WHERE kind = 'export' AND state IN ('queued', 'running', 'succeeded');
@@ -206,6 +241,41 @@ CREATE VIEW job_file_keys AS
         jsonb_array_elements_text(part.value -> 'files') AS name
     UNION SELECT (checkpoint ->> 'prefix') || '/' || name
         FROM jobs, jsonb_array_elements_text(checkpoint -> 'files') AS name WHERE checkpoint IS NOT NULL;
+
+-- Whether a slot is busy: exports do not count.
+CREATE VIEW running_refinements AS SELECT queue_id FROM jobs WHERE kind = 'refine' AND state = 'running';
+-- How much work waits, for autoscalers and monitoring. Names and columns of this view are kept: what runs outside of
+-- this program reads it (docs/operations.md). A role needs no other right than SELECT on it.
+-- A slot of any kind takes any job, so that `waiting`, `held` and `oldest_s` are the same for each kind. `held` jobs
+-- wait for their tenant's limit: no further slot would be given one. An export needs no slot of its own while a
+-- refinement waits or runs: the slot of a refinement exports beside it. Counted as a waiting job, it made autoscalers
+-- start a worker that found nothing to do; counted as a running one, it hid a worker that was free.
+CREATE VIEW queue_depth AS
+    SELECT kinds.slot_kind,
+        count(*) FILTER (WHERE job.state = 'queued' AND NOT job.held AND job.needs_slot) AS waiting,
+        count(*) FILTER (WHERE job.state = 'queued' AND job.held) AS held,
+        count(*) FILTER (WHERE job.state = 'running' AND job.needs_slot
+            AND coalesce(job.slot_kind, 'cpu') = kinds.slot_kind) AS running,
+        greatest(coalesce(extract(epoch FROM clock_timestamp()
+            - min(job.created_at) FILTER (WHERE job.state = 'queued' AND NOT job.held)), 0), 0)::float8 AS oldest_s
+    FROM (VALUES ('cpu'), ('gpu')) AS kinds (slot_kind)
+    LEFT JOIN (
+        SELECT state, held, slot_kind, created_at, kind = 'refine' OR NOT EXISTS (
+            SELECT FROM jobs WHERE kind = 'refine' AND NOT held AND state IN ('queued', 'running')) AS needs_slot
+        FROM jobs WHERE state IN ('queued', 'running')
+    ) AS job ON true
+    GROUP BY kinds.slot_kind ORDER BY kinds.slot_kind;
+
+-- Links that show the page of one job to people without a key. Like a key, only the SHA-256 of the text is stored.
+CREATE TABLE result_links (
+    id text PRIMARY KEY,
+    job_id text NOT NULL REFERENCES jobs ON DELETE CASCADE,
+    prefix text NOT NULL UNIQUE,
+    sha256 bytea NOT NULL,
+    created_at timestamptz NOT NULL DEFAULT clock_timestamp(),
+    expires_at timestamptz NOT NULL
+);
+CREATE INDEX result_links_of_job ON result_links (job_id, created_at);
 
 CREATE TABLE job_events (
     job_id text NOT NULL REFERENCES jobs ON DELETE CASCADE,
@@ -234,7 +304,13 @@ CREATE TABLE fair_clock (
 INSERT INTO fair_clock (priority) VALUES (-1), (0), (1);
 
 -- Which of the queue's workers is which slot, for as long as it lives.
-CREATE TABLE slots (host text, name text, worker_id bigint NOT NULL, PRIMARY KEY (host, name));
+CREATE TABLE slots (
+    host text,
+    name text,
+    worker_id bigint NOT NULL,
+    kind text GENERATED ALWAYS AS (CASE WHEN name LIKE 'gpu%' THEN 'gpu' ELSE 'cpu' END) STORED,
+    PRIMARY KEY (host, name)
+);
 
 -- File prefixes to delete, written in the transaction that makes them garbage.
 CREATE TABLE trash (
@@ -285,6 +361,7 @@ CREATE TABLE webhook_deliveries (
     created_at timestamptz NOT NULL DEFAULT clock_timestamp(),
     finished_at timestamptz
 );
+CREATE INDEX webhook_deliveries_over ON webhook_deliveries (finished_at) WHERE finished_at IS NOT NULL;
 CREATE INDEX webhook_deliveries_pending ON webhook_deliveries (due_at) WHERE state = 'pending';
 CREATE INDEX webhook_deliveries_newest ON webhook_deliveries (webhook_id, created_at DESC, id DESC);
 
@@ -298,6 +375,15 @@ CREATE TABLE webhook_attempts (
     error text,
     PRIMARY KEY (delivery_id, number)
 );
+
+-- Rate limits, shared by all web processes: when the client's bucket is full again, if it sends nothing more. Such a
+-- time says all about a bucket; a row of the past is a full one. Unlogged: after a crash all buckets are full.
+CREATE UNLOGGED TABLE token_buckets (
+    policy text NOT NULL,
+    client text NOT NULL,
+    full_at timestamptz NOT NULL,
+    PRIMARY KEY (policy, client)
+) WITH (fillfactor = 50);
 
 -- What monitoring counts, in the transaction that makes it so: exact, and no process has to be asked. Each count is a
 -- row of its own first, so that no two jobs wait for one another's counter; a janitor adds the rows up.
