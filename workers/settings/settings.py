@@ -103,7 +103,9 @@ class Settings(BaseSettings):
         6.0, gt=0, description="Seconds a cancelled job has to write a partial result."
     )
     job_timeout_s: float = Field(2 * 3600, gt=0, description="Longest run of one attempt.")
-    check_timeout_s: float = Field(900, gt=0, description="Longest validation of one dataset.")
+    check_timeout_s: float = Field(
+        900, gt=0, description="Longest validation of one dataset; of small ones less."
+    )
     max_attempts: int = Field(
         3,
         ge=1,

@@ -16,7 +16,7 @@ from biresnerf.data.model.image_order import names_of_poses, natural_key
 from biresnerf.data.model.pose_validation import refuse_coinciding
 from biresnerf.data.photos.guessed_lens import guess_note
 from biresnerf.data.photos.masks import mask_beside, mask_notes
-from biresnerf.data.photos.named_images import refuse_outside, refuse_too_few
+from biresnerf.data.photos.named_images import refuse_more_than_files, refuse_outside, refuse_too_few
 from biresnerf.data.photos.photo_folders import (
     few_names,
     photos_beside,
@@ -39,6 +39,8 @@ def bind_images(parsed: ParsedPoses, root: Path, within: Path | None = None) -> 
         InputError: ``no_images``, ``image_missing``, ``pose_count_mismatch`` or a code of `dataset_of`.
     """
     named = parsed.assign is None
+    if named and within is not None:
+        refuse_more_than_files(parsed.source.files[0].name, len(parsed.entries), within)
     files = photos_beside(root, parsed.photo_folders)
     if named and not files:
         files = photos_named(root, [entry.name for entry in parsed.entries])

@@ -71,6 +71,8 @@ class Codec:
             format that recognises a file goes first.
         count: how many images such a place has, for a format of which a set may hold several places, each with its
             photos beside: the one with most images is read.
+        refuse_early: for uploaded sets, raises InputError for what would take long to parse and cannot be used: of
+            the pose file, and the folder that no file may lie outside of.
         write: None for formats that are only read.
         given_back: whether this set came in this format, so that its result is written in it too.
     """
@@ -83,6 +85,7 @@ class Codec:
     image_root: Callable[[Path], Path] = lambda place: place.parent
     loose: bool = False
     count: Callable[[Path], int] | None = None
+    refuse_early: Callable[[Path, Path], None] | None = None
     write: Writer | None = None
     given_back: Callable[[Dataset], bool] = lambda dataset: False
 

@@ -44,15 +44,16 @@ def parsed_rows(
     Raises:
         InputError: ``duplicate_image`` for a name that two rows have, ``pose_file_invalid`` for too many rows.
     """
+    rows = list(rows)
+    if len(rows) > MAX_ROWS:
+        hint = "Split the set."
+        raise InputError("pose_file_invalid", f"more than {MAX_ROWS} poses.", where=files[0].name, hint=hint)
     entries = tuple(entry_of(*row) for row in rows)
     twice = [name for name, count in Counter(entry.name for entry in entries).items() if count > 1]
     if twice:
         second = [entry for entry in entries if entry.name == twice[0]][1]
         detail = f"{twice[0]!r} is there twice."
         raise InputError("duplicate_image", detail, where=second.where, hint="Remove one.")
-    if len(entries) > MAX_ROWS:
-        hint = "Split the set."
-        raise InputError("pose_file_invalid", f"more than {MAX_ROWS} poses.", where=files[0].name, hint=hint)
     return ParsedPoses(
         SourceFormat(dialect, files=tuple(files)),
         entries,

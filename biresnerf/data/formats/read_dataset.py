@@ -60,6 +60,8 @@ def read_dataset(
         contents = replace(contents, notes=(*contents.notes, *notes))
     else:
         codec = ALL_CODECS[contents.format]
+        if within is not None and codec.refuse_early is not None:
+            codec.refuse_early(contents.poses, within)
         parsed = _parse(contents.format, contents.root, contents.poses)
         dataset = codec.bind(without_problems(parsed, strict=strict), contents.root, within)
     for index, frame in enumerate(dataset.frames):

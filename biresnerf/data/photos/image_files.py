@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 from PIL import Image
+from PIL.JpegImagePlugin import MARKER
 from PIL.TiffImagePlugin import TiffImageFile
 
 from biresnerf.data.photos.kinds import linear_light, raw_file
@@ -33,6 +34,9 @@ _MORE_FORMATS = (
 )  # fmt: skip
 _JPEG = (".jpg", ".jpeg")
 MAX_IMAGE_PIXELS = 150_000_000  # beyond any camera; a guard against files that unpack to gigabytes
+# Of a JPEG, before its pixels. Depth maps and thermal images in one are in hundreds, EXIF in one.
+MAX_PIECES, MAX_EXIF_SEGMENTS = 65_536, 64
+_APP1, _START_OF_SCAN = 0xFFE1, 0xFFDA
 EXIF_ORIENTATION = 0x0112
 _TIFF_WIDTH, _TIFF_HEIGHT = 0x0100, 0x0101
 _EXIF_SUB_IFD = 0x8769
@@ -174,6 +178,7 @@ def open_image(path: Path, name: str) -> Image.Image:
     Its content says of which format it is. Only RAW photos are known by their names: most are TIFF files otherwise, of
     which Pillow would take the preview.
     """
+    _refuse_segments(path, name)
     try:
         image = Image.open(path, formats=_formats_for(path))
     except Image.DecompressionBombError:
@@ -198,6 +203,42 @@ def open_image(path: Path, name: str) -> Image.Image:
         image.close()
         raise _too_large(name)
     return image
+
+
+def _refuse_segments(path: Path, name: str) -> None:
+    """Raises InputError ``not_an_image`` for a JPEG whose head is in more pieces than any camera or program writes.
+
+    Pillow takes time by their number, and by its square where they are EXIF. This walks as it does.
+    """
+    pieces = exif = 0
+    try:
+        with path.open("rb") as file:
+            start = file.read(3)
+            mark = start[2:] if start == b"\xff\xd8\xff" else b""  # as Pillow knows a JPEG
+            while mark and pieces <= MAX_PIECES and exif <= MAX_EXIF_SEGMENTS:
+                pieces += 1
+                if mark != b"\xff":  # junk
+                    mark = file.read(1)
+                    continue
+                kind = int.from_bytes(b"\xff" + file.read(1), "big")
+                if kind == _START_OF_SCAN or (kind not in MARKER and kind not in (0xFF00, 0xFFFF)):
+                    return
+                if kind in MARKER and MARKER[kind][2] is not None:
+                    length = int.from_bytes(file.read(2), "big") - 2
+                    begin = file.read(min(max(length, 0), 4))
+                    exif += kind == _APP1 and begin == b"Exif"
+                    file.seek(max(length - len(begin), 0), 1)
+                mark = b"\xff" if kind == 0xFFFF else file.read(1)
+            if not mark:
+                return
+    except OSError:  # Pillow finds the same
+        return
+    raise InputError(
+        "not_an_image",
+        f"has a head of more than {MAX_PIECES} pieces, or {MAX_EXIF_SEGMENTS} of EXIF.",
+        where=name,
+        hint="Save it again without metadata, or remove its frame.",
+    )
 
 
 def _formats_for(path: Path) -> tuple[str, ...]:

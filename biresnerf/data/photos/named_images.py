@@ -43,7 +43,7 @@ def refuse_outside(paths: Sequence[Path], names: Sequence[str], within: Path, wh
             )
 
 
-def refuse_more_than_files(file: Path, frames: int, within: Path) -> None:
+def refuse_more_than_files(where: str, frames: int, within: Path) -> None:
     """Raises InputError ``image_missing`` where ``within`` has too few files for most of the frames to have their own.
 
     Looking for each would take a while, with a hundred thousand frames a minute.
@@ -53,6 +53,6 @@ def refuse_more_than_files(file: Path, frames: int, within: Path) -> None:
         raise InputError(
             "image_missing",
             f"{frames} frames, but the set has only {files} files.",
-            where=f"{file.name} frames",
+            where=where,
             hint="Put an image there for each frame (paths are relative to the file), or remove frames.",
         )

@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 from biresnerf.data.photos.image_files import FocalPlane, ImageHeader, read_header
+from biresnerf.errors import InputError
 
 PHOTO = Image.new("RGB", (30, 20), (10, 120, 240))
 SUFFIXES = [".jpg", ".png", ".webp", ".tif"]
@@ -83,3 +84,33 @@ def test_pages_and_frames_behind_the_first_are_noticed(tmp_path, suffix):
     path = tmp_path / f"pages{suffix}"
     PHOTO.save(path, save_all=True, append_images=[Image.new("RGB", PHOTO.size)])
     assert read_header(path, "pages").several
+
+
+def jpeg_with(path, start: bytes):
+    """A JPEG with these bytes behind its first mark."""
+    Image.new("RGB", (8, 6)).save(path, "JPEG")
+    path.write_bytes(b"\xff\xd8" + start + path.read_bytes()[2:])
+    return path
+
+
+EXIF_PIECE = b"\xff\xe1\x00\x10Exif\0\0abcdefgh"
+
+
+@pytest.mark.parametrize(
+    "start",
+    [EXIF_PIECE * 1_000_000, b"\xff" * 2_000_000 + EXIF_PIECE, b"\xff\xd0" * 9 + b"\xff\xff" + EXIF_PIECE * 100_000,
+     b"\xff\xe5\x00\x04ab" * 500_000],
+    ids=["exif", "fill", "exif behind fill", "other segments"],
+)  # fmt: skip
+def test_a_jpeg_whose_head_is_in_a_million_pieces_is_refused_by_its_name_at_once(tmp_path, start):
+    path = jpeg_with(tmp_path / "a.jpg", start)
+    began = time.process_time()
+    with pytest.raises(InputError, match="pieces") as caught:
+        read_header(path, "a.jpg")
+    assert (caught.value.code, caught.value.where) == ("not_an_image", "a.jpg")
+    assert time.process_time() - began < 1
+
+
+def test_a_jpeg_with_a_long_profile_and_a_depth_map_in_its_head_is_read(tmp_path):
+    start = EXIF_PIECE + b"\xff" * 30 + (b"\xff\xe1\xff\xff" + b"x" * 65_533) * 300
+    assert read_header(jpeg_with(tmp_path / "a.jpg", start), "a.jpg")[:2] == (8, 6)

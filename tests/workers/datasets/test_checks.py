@@ -12,6 +12,7 @@ import pytest
 from biresnerf.wire.datasets import DatasetView
 from tests.workers.conftest import ACCEPTED, SHORT_STALL, environment, quick_settings
 from tests.workers.datasets.test_datasets import chunks
+from workers.datasets import dataset_check
 from workers.engine import Stores, open_stores
 from workers.process.disk_space import EXIT_DISK
 from workers.settings.settings import Settings
@@ -67,6 +68,17 @@ async def test_a_check_that_does_not_pass_rejects_the_dataset(database_url: str,
         assert checked.error is not None
         assert (checked.state, checked.error.code) == ("rejected", code)
     assert list((settings.scratch_dir / "checks").iterdir()) == []
+
+
+async def test_a_set_of_few_and_small_files_is_not_checked_for_as_long_as_the_largest(
+    database_url: str, tmp_path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(dataset_check, "ANY_S", 0.5)
+    monkeypatch.setattr(dataset_check, "FILE_S", 0.5)
+    async with asyncio.timeout(20):
+        checked = await checking(database_url, tmp_path, "import time; time.sleep(60)", check_timeout_s=900.0)
+    assert checked.error is not None
+    assert (checked.error.code, checked.error.detail) == ("check_timeout", "The check took longer than 1 s.")
 
 
 async def test_a_check_that_found_the_disk_full_is_made_again(database_url: str, tmp_path):

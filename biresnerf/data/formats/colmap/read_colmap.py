@@ -16,6 +16,7 @@ from biresnerf.data.model.colmap_scene import ColmapModel
 from biresnerf.data.model.dataset import Dataset, IntrinsicsSource, SourceFormat
 from biresnerf.data.model.part_of_model import without_images
 from biresnerf.data.photos.image_files import read_header
+from biresnerf.data.photos.named_images import refuse_more_than_files
 from biresnerf.data.photos.orientation import same_shape
 from biresnerf.data.photos.photo_folders import (
     IMAGE_FOLDER,
@@ -58,6 +59,8 @@ def bind_colmap(parsed: ParsedPoses, root: Path, within: Path | None = None) -> 
     """
     model = parsed.source.colmap
     assert model is not None, "parse_colmap gives it"
+    if within is not None:
+        refuse_more_than_files(_images_table(model), len(parsed.entries), within)
     files = images_beside(root)
     prefix = f"{IMAGE_FOLDER}/"
     if parsed.entries and all(entry.name.startswith(prefix) for entry in parsed.entries):

@@ -13,7 +13,11 @@ import numpy as np
 
 from biresnerf.data.formats.codec import Codec, WriteContext
 from biresnerf.data.formats.simple.points_ply import POINTS_PLY, write_points_ply
-from biresnerf.data.formats.transforms.read_transforms import bind_transforms, parse_transforms
+from biresnerf.data.formats.transforms.read_transforms import (
+    bind_transforms,
+    parse_transforms,
+    refuse_frames_without_files,
+)
 from biresnerf.data.formats.transforms.write_intrinsics import lens_values
 from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.conventions import file_from_world_from_cam
@@ -117,4 +121,12 @@ def _write(refined: RefinedSet, path: Path, context: WriteContext) -> None:
     write_nerfstudio(refined, path, context.dataset)
 
 
-CODECS = (Codec(NERFSTUDIO, parse=parse_transforms, bind=bind_transforms, write=_write),)
+CODECS = (
+    Codec(
+        NERFSTUDIO,
+        parse=parse_transforms,
+        bind=bind_transforms,
+        refuse_early=refuse_frames_without_files,
+        write=_write,
+    ),
+)

@@ -12,7 +12,11 @@ from typing import Any
 import numpy as np
 
 from biresnerf.data.formats.codec import Codec
-from biresnerf.data.formats.transforms.read_transforms import bind_transforms, parse_transforms
+from biresnerf.data.formats.transforms.read_transforms import (
+    bind_transforms,
+    parse_transforms,
+    refuse_frames_without_files,
+)
 from biresnerf.data.formats.transforms.write_intrinsics import lens_values, ngp_coefficients
 from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.conventions import file_from_world_from_cam
@@ -111,6 +115,7 @@ CODECS = (
     Codec(
         INSTANT_NGP,
         parse=parse_transforms,
+        refuse_early=refuse_frames_without_files,
         bind=bind_transforms,
         write=lambda refined, path, _: write_transforms_ngp(refined, path),
     ),

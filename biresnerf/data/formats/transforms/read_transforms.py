@@ -22,7 +22,7 @@ from biresnerf.data.formats.transforms.read_intrinsics import Fields, camera_of_
 from biresnerf.data.model.conventions import world_from_cam_of_file
 from biresnerf.data.model.dataset import Dataset, SourceFormat
 from biresnerf.data.model.pose_validation import ROTATION_WARNED, rigid_matrix
-from biresnerf.data.model.untrusted_file import invalid_file, refuse_non_finite
+from biresnerf.data.model.untrusted_file import invalid_file, read_json, refuse_non_finite
 from biresnerf.data.photos.masks import dynamic_mask, named_mask
 from biresnerf.data.photos.named_images import refuse_more_than_files, refuse_too_few
 from biresnerf.data.photos.photo_folders import unused_image_notes
@@ -49,7 +49,17 @@ def read_transforms(path: Path, within: Path | None = None) -> Dataset:
     Raises:
         InputError: with the file, the field and a hint; codes as in docs/input.md.
     """
+    if within is not None:
+        refuse_frames_without_files(path, within)
     return bind_transforms(without_problems(parse_transforms(path.parent, path)), path.parent, within)
+
+
+def refuse_frames_without_files(path: Path, within: Path) -> None:
+    """Raises InputError ``image_missing`` where most frames have no file, before their poses are looked at."""
+    document = read_json(path, apart="frames")
+    frames = document.get("frames") if isinstance(document, dict) else document
+    if isinstance(frames, list):
+        refuse_more_than_files(f"{path.name} frames", len(frames), within)
 
 
 def parse_transforms(_root: Path, path: Path) -> ParsedPoses:
@@ -88,8 +98,6 @@ def bind_transforms(parsed: ParsedPoses, root: Path, within: Path | None = None)
     """
     path = parsed.source.files[0]
     refuse_too_few(len(parsed.entries), f"{path.name} frames")
-    if within is not None:
-        refuse_more_than_files(path, len(parsed.entries), within)
     pairs, found = find_photos(path, root, parsed.entries, within, strict=parsed.strict)
     parsed = _with_older_transform(replace(parsed, entries=tuple(entry for _, entry in pairs)))
     masked = [

@@ -9,7 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.formats.codec import Codec, WriteContext
-from biresnerf.data.formats.transforms.read_transforms import bind_transforms, parse_transforms
+from biresnerf.data.formats.transforms.read_transforms import (
+    bind_transforms,
+    parse_transforms,
+    refuse_frames_without_files,
+)
 from biresnerf.data.formats.transforms.write_intrinsics import (
     family,
     has_own_intrinsics,
@@ -144,4 +148,12 @@ def _write(refined: RefinedSet, path: Path, context: WriteContext) -> None:
         write_transforms(context.dataset, refined.world_from_cam, path)
 
 
-CODECS = (Codec(TRANSFORMS, parse=parse_transforms, bind=bind_transforms, write=_write),)
+CODECS = (
+    Codec(
+        TRANSFORMS,
+        parse=parse_transforms,
+        bind=bind_transforms,
+        refuse_early=refuse_frames_without_files,
+        write=_write,
+    ),
+)

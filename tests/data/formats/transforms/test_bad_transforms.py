@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from biresnerf.data.formats.pose_rows import MAX_ROWS, parsed_rows
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.formats.transforms.read_transforms import read_transforms
 from biresnerf.errors import InputError
@@ -244,3 +245,37 @@ def test_twenty_thousand_frames_for_a_few_files_are_refused_without_looking_for_
         read_transforms(path, within=tmp_path)
     assert caught.value.code == "image_missing"
     assert time.process_time() - began < 2, "looking for each takes more than 4 s"
+
+
+def test_frames_without_files_are_refused_before_their_poses_are_looked_at(tmp_path):
+    document = nerfstudio_scene(tmp_path)
+    document["frames"] = [{"file_path": f"images/{n}.jpg", "transform_matrix": "none"} for n in range(200)]
+    with pytest.raises(InputError, match="200 frames, but the set has only 5 files"):
+        read_dataset(save(tmp_path, document), within=tmp_path)
+
+
+def test_rows_and_models_of_images_that_no_file_is_there_for_are_refused_without_looking_for_each(tmp_path):
+    nerfstudio_scene(tmp_path)
+    rows = "".join(f"images/{n}.png,0,0,{n},1,0,0,0\n" for n in range(3000))
+    (tmp_path / "poses.csv").write_text("image,x,y,z,qw,qx,qy,qz\n" + rows)
+    with pytest.raises(InputError, match="3000 frames, but the set has only") as caught:
+        read_dataset(tmp_path, within=tmp_path)
+    assert_complete(caught.value, "image_missing", "poses.csv")
+    (tmp_path / "poses.csv").unlink()
+    model = tmp_path / "sparse"
+    model.mkdir()
+    (model / "cameras.txt").write_text("1 PINHOLE 32 32 30 30 16 16\n")
+    (model / "points3D.txt").touch()
+    (model / "images.txt").write_text("".join(f"{n + 1} 1 0 0 0 0 0 {n} 1 {n}.png\n\n" for n in range(3000)))
+    with pytest.raises(InputError, match="3000 frames, but the set has only") as caught:
+        read_dataset(tmp_path, within=tmp_path)
+    assert_complete(caught.value, "image_missing", "images.txt")
+
+
+def test_more_rows_than_any_set_has_are_refused_before_they_are_read(tmp_path):
+    def read():
+        raise AssertionError("a row was read")
+
+    rows = [(str(n), f"row {n}", read) for n in range(MAX_ROWS + 1)]
+    with pytest.raises(InputError, match="more than 100000 poses"):
+        parsed_rows("csv", [tmp_path / "poses.csv"], rows)
