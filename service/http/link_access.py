@@ -1,9 +1,10 @@
-"""What a link to a job's page opens: that job to read, without its log, and nothing else."""
+"""What a link to a job's page opens: that job to read, without its log and its owner's names, and nothing else."""
 
 from __future__ import annotations
 
 import re
 
+from biresnerf.wire.jobs import JobView
 from service.http.problems import ProblemError
 
 LINK_PREFIX = "brl_"
@@ -16,3 +17,10 @@ def require_shown(job_id: str, method: str, path: str) -> None:
     shown = path.startswith(base) and _SHOWN.fullmatch(path[len(base) :])
     if method not in ("GET", "HEAD") or not shown:
         raise ProblemError("not_found", "The link does not open this address.")
+
+
+def shown_to_strangers(job: JobView) -> JobView:
+    """The job without its tenant, labels, dataset, and the jobs that it was made from."""
+    unnamed = {"tenant": "", "labels": {}, "parent": None, "forked_from": None, "fixed_from": None}
+    links = job.links.model_copy(update={"dataset": ""})
+    return job.model_copy(update={**unnamed, "dataset_id": "", "links": links})

@@ -36,8 +36,9 @@ IdempotencyKey = Annotated[
 
 def job_etag(job: JobView) -> str:
     """A weak ETag of the job's current state."""
-    # Other jobs change the position of a queued job but not its revision.
-    return f'W/"{job.revision}-{job.queue_position or 0}"'
+    # Other jobs change the position of a queued job but not its revision. A browser may have the job as its owner sees
+    # it, and as strangers do.
+    return f'W/"{job.revision}-{job.queue_position or 0}{"" if job.dataset_id else "-shared"}"'
 
 
 def job_response(

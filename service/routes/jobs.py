@@ -12,6 +12,7 @@ from biresnerf.wire.jobs import CancelJob, JobList, JobState, JobTexts, JobView,
 from service.http.access import JobWriter, ReadCaller
 from service.http.dependencies import IfNoneMatch, JobId, Paged
 from service.http.http_conditionals import none_match
+from service.http.link_access import shown_to_strangers
 from service.http.problems import ProblemError, declared, wrong_field
 from service.intake.json_body import JsonRoute, json_content, read_json, validate
 from service.responses.job_responses import (
@@ -146,6 +147,8 @@ async def get_job(
     """The current job: state, stage, step, loss, seconds left, position in the queue."""
     jobs = caller.jobs
     job = await (waited_for(jobs, job_id, wait, caller.service.closing) if wait else jobs.get(job_id))
+    if caller.link is not None:
+        job = shown_to_strangers(job)
     headers = {} if job.final else {"Retry-After": POLL_S}
     if not none_match(if_none_match, job_etag(job)):
         return Response(status_code=304, headers={"ETag": job_etag(job), **headers})

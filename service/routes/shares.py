@@ -39,10 +39,17 @@ async def share_artifact(
     """Creates a link to one file that needs no key and expires. Anyone with the link can read the file."""
     artifact = await find_artifact(caller.jobs, job_id, body.name)
     expires = int(time.time()) + body.valid_s
-    signed = _signature(caller.service.stores.share_key, job_id, artifact.name, expires)
+    current = await caller.links.share_round(job_id)
+    signed = _signature(caller.service.stores.share_key, job_id, artifact.name, expires, current)
     href = f"/v1/shared/{quote(job_id, safe='')}/{quote(artifact.name)}?expires={expires}&signature={signed}"
     response.headers["Location"] = href
     return ShareView(name=artifact.name, href=href, expires_at=datetime.fromtimestamp(expires, UTC))
+
+
+@router.delete("/jobs/{job_id}/shares", status_code=204)
+async def revoke_shares(job_id: JobId, caller: JobWriter) -> None:
+    """Revokes all links to single files of this job: they open nothing from the next request on."""
+    await caller.links.revoke_shares(job_id)
 
 
 @router.post(
@@ -89,21 +96,22 @@ async def get_shared(
     conditions: DownloadConditions,
 ) -> Response:
     """The file of a link created by `POST /v1/jobs/{id}/shares`. Needs no key."""
-    _require_signature(service.stores.share_key, job_id, name, expires, signed)
+    current = await service.stores.links.share_round(job_id)
+    made = _signature(service.stores.share_key, job_id, name, expires, current)
+    _require_signature(made, expires, signed)
     artifact = await find_artifact(service.stores.jobs, job_id, name)
     return await artifact_response(service, artifact, conditions)
 
 
-def _signature(key: bytes, job_id: str, name: str, expires: int) -> str:
-    """The signature of this file name and expiry time with ``key``."""
-    message = "\n".join(["biresnerf share 1", job_id, str(expires), name]).encode()
+def _signature(key: bytes, job_id: str, name: str, expires: int, current: int) -> str:
+    """The signature of this file name and expiry time with ``key``, in the job's ``current`` round."""
+    message = "\n".join([f"biresnerf share {1 + current}", job_id, str(expires), name]).encode()
     return base64.urlsafe_b64encode(hmac.digest(key, message, hashlib.sha256)).decode().rstrip("=")
 
 
-def _require_signature(key: bytes, job_id: str, name: str, expires: int, given: str) -> None:
-    """Raises ``ProblemError``: ``not_found`` for a wrong signature, ``link_expired`` after the expiry time."""
-    made = _signature(key, job_id, name, expires)
+def _require_signature(made: str, expires: int, given: str) -> None:
+    """Raises ``ProblemError``: ``not_found`` for a wrong or revoked signature, ``link_expired`` after its time."""
     if not hmac.compare_digest(made.encode(), given.encode(errors="replace")):
-        raise ProblemError("not_found", "This service did not create this link.")
+        raise ProblemError("not_found", "This service did not create this link, or it was revoked.")
     if expires < time.time():
         raise ProblemError("link_expired", "The link has expired.")

@@ -1,4 +1,7 @@
-"""Links that show the page of one job, read-only and for a while: made, listed, recognised, revoked."""
+"""Links that show the page of one job, read-only and for a while: made, listed, recognised, revoked.
+
+Signed links to single files are not kept: the database has their job's round, which they were signed with.
+"""
 
 from __future__ import annotations
 
@@ -85,6 +88,19 @@ class ResultLinkStore(OwnedStore):
         )
         async with self._database.transaction() as connection:
             await connection.required_row(f"No link {link_id}.", sql, link_id, job_id, self._tenant)
+
+    async def share_round(self, job_id: str) -> int:
+        """The round that links to files of the job are signed with now; raises `NotFound`."""
+        sql = f"SELECT share_round FROM jobs WHERE id = %s AND {_MINE}"
+        async with self._database.transaction() as connection:
+            row = await connection.required_row(f"No job {job_id}.", sql, job_id, self._tenant)
+        return int(row["share_round"])
+
+    async def revoke_shares(self, job_id: str) -> None:
+        """End all links to files of the job, by the next round; raises `NotFound`."""
+        sql = f"UPDATE jobs SET share_round = share_round + 1 WHERE id = %s AND {_MINE} RETURNING id"
+        async with self._database.transaction() as connection:
+            await connection.required_row(f"No job {job_id}.", sql, job_id, self._tenant)
 
     async def recognise(self, text: str) -> OpenLink | None:
         """The living link with this text; None says no more than that there is none."""

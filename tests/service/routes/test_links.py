@@ -8,7 +8,17 @@ from pathlib import Path
 import httpx
 import pytest
 
-from tests.service.conftest import Running, Tenant, client_with, operator, problem, ready_dataset, submit
+from biresnerf.wire.jobs import JobView
+from tests.service.conftest import (
+    Running,
+    Tenant,
+    client_with,
+    finished,
+    operator,
+    problem,
+    ready_dataset,
+    submit,
+)
 from tests.service.http.test_access import GUARDED, address
 
 
@@ -55,6 +65,32 @@ def test_a_link_opens_its_job_to_read_and_no_other_route(
             problem(guest.get(path), 404, "not_found")
         assert guest.get("/metrics").status_code == 401
     assert anna.http.get(f"{base}/artifacts/report.json").status_code == 200, "nothing was deleted"
+
+
+def test_strangers_do_not_learn_whose_the_job_is_nor_what_its_owner_calls_it(
+    closed: Running, tenants: tuple[Tenant, Tenant]
+) -> None:
+    anna, _ = tenants
+    labels = {"customer": "Museum of Nothing"}
+    options = {"preset": "fast", "steps": 20, "seed": 5}
+    body = {"dataset_id": anna.dataset, "options": options, "labels": labels}
+    job = finished(anna.http, anna.http.post("/v1/jobs", json=body).json()["id"])
+    token = anna.http.post(f"/v1/jobs/{job['id']}/links", json={}).json()["token"]
+    address = f"/v1/jobs/{job['id']}"
+    mine = anna.http.get(address)
+    with client_with(closed, token) as guest:
+        shown = guest.get(address)
+        assert JobView.model_validate(shown.json()).id == job["id"]
+        for told in ("anna", anna.dataset, "customer", "Museum"):
+            assert told in mine.text
+            assert told not in shown.text
+        kept = {"id", "state", "verdict", "options", "resolved_options", "metrics", "finished_at"}
+        assert {name: shown.json()[name] for name in kept} == {name: mine.json()[name] for name in kept}
+        # A browser that has one of the two must not take it for the other.
+        assert shown.headers["etag"] != mine.headers["etag"]
+        again = guest.get(address, headers={"If-None-Match": mine.headers["etag"]})
+        assert again.status_code == 200
+        assert guest.get(address, headers={"If-None-Match": shown.headers["etag"]}).status_code == 304
 
 
 def test_a_link_ends_when_it_is_revoked_and_not_before(

@@ -84,6 +84,28 @@ async def test_a_link_opens_one_file_for_its_time_and_nothing_else(settings: Set
         problem(await http.post(f"/v1/jobs/{job}/shares", json={"name": NAME}), 401, "missing_credentials")
 
 
+async def test_links_to_files_of_a_job_end_when_they_are_revoked_and_those_of_another_do_not(
+    settings: Settings,
+):
+    async with serving(settings) as http:
+        one, other = [await result(http, settings, content) for content in (b"one", b"other")]
+
+        async def share(job: str) -> str:
+            made = await http.post(f"/v1/jobs/{job}/shares", json={"name": NAME, "valid_s": 3600})
+            found: str = made.json()["href"]
+            return found
+
+        first, others = await share(one), await share(other)
+        for _ in range(2):
+            assert (await http.get(first)).content == b"one"
+            assert (await http.delete(f"/v1/jobs/{one}/shares")).status_code == 204
+            problem(await http.get(first), 404, "not_found")
+            assert (await http.get(others)).content == b"other"
+            ended, first = first, await share(one)
+            problem(await http.get(ended), 404, "not_found")
+        problem(await http.delete("/v1/jobs/job_00000000000000000000000000/shares"), 404, "not_found")
+
+
 async def test_what_a_tenant_has_sent_needs_no_sending_and_others_never_know(settings: Settings):
     ours, theirs = b"our photo", b"their photo"
     async with open_database(settings.require_database_url(), connections=1) as database:

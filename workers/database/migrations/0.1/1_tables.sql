@@ -136,7 +136,7 @@ $$;
 -- `crashes`: attempts that crashed since the last checkpoint; `losses`: that lost their worker, which is seldom the
 -- job's fault and counts apart; `setback`: why the last attempt ended before its job did. `slot_kind`: of the slot that
 -- runs the job, or ran it last. `fixed_from`: the job whose result this one joins its photos to. (No reference: what
--- was joined stays when the other is deleted.)
+-- was joined stays when the other is deleted.) `share_round`: signed into links to its files; the next one ends them.
 -- fillfactor leaves space in each page, so that progress updates stay HOT (no index writes).
 CREATE TABLE jobs (
     id text PRIMARY KEY,
@@ -164,6 +164,7 @@ CREATE TABLE jobs (
     attempt int NOT NULL DEFAULT 0,
     crashes int NOT NULL DEFAULT 0,
     losses int NOT NULL DEFAULT 0,
+    share_round int NOT NULL DEFAULT 0,
     setback text CHECK (setback IN ('worker_lost', 'killed', 'error', 'disk_full', 'store_away')),
     slot_kind text,
     run_token uuid,
