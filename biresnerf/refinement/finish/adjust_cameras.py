@@ -17,12 +17,15 @@ from biresnerf.refinement.start.first_step import adjusts_cameras
 logger = logging.getLogger(__name__)
 
 
-def adjust_cameras(stages: TwoStages) -> Finish:
+def adjust_cameras(stages: TwoStages, *, moves: bool = True) -> Finish:
     """Adjust all cameras at once, and where left-out evidence says that is better move them and hold them there.
 
     Cameras that their own matches contradict are placed by those first. Photos have the last word: nothing is moved
     where they object, by fields that are trained on them unless patches of them speak for it. Methods of others are
     left alone.
+
+    Args:
+        moves: whether cameras may move; if not, what the evidence says is only gathered.
 
     Raises:
         Interrupted: stopped; a continued run adjusts again.
@@ -32,11 +35,14 @@ def adjust_cameras(stages: TwoStages) -> Finish:
         return Finish()
     certainty = optimiser.lenses.certainty
     with stages.timed("adjusting", amount=adjustment(stages.scene)):
-        stages.repair.place_by_matches()
+        if moves:
+            stages.repair.place_by_matches()
         found = choose_poses(stages.scene, optimiser, partial(_announce, stages))
     if found is None:
         return Finish()
     chosen, finish = found
+    if not moves:
+        return finish
     if finish.heeds_photos:
         stages.forecast.left["adjusting"] = 0.0  # unless photos object
     cameras, lenses = optimiser.lenses.refined(stages.scene.dataset).cameras, chosen.lenses

@@ -21,7 +21,8 @@ def run_stage_2(stages: TwoStages) -> Finish:
 
     Where the first adjustment finds better poses than the field's, they stand still from then on, and the field learns
     at them for a while. It would only bend them. They are adjusted again only if patches of the photos had no say yet:
-    the surface of a young field may have been too rough for them; and if the run's time allows.
+    the surface of a young field may have been too rough for them; and if the run's time allows. A run that was resumed
+    after the first adjustment gathers the evidence once more, and reports what was chosen then.
 
     Raises:
         Interrupted: stopped; a continued run goes on from there.
@@ -33,17 +34,21 @@ def run_stage_2(stages: TwoStages) -> Finish:
         first = adjust_cameras(stages)
         if stages.optimiser.poses_held:
             stages.optimiser.end_after(LEARNING)
-        stages.record = stages.record.model_copy(update={"adjusted": True})
-        stages.adjusts_again = not _is_over(stages, first) and _time_to_adjust_again(stages)
+        again = not _is_over(stages, first) and _time_to_adjust_again(stages)
+        did = {"adjusted": True, "candidates": first.candidates, "believed": first.fit is not None}
+        stages.record = stages.record.model_copy(update={**did, "adjusts_again": again})
         expect_as_measured(stages)
         stages.replan()
     stages.run_stage_2()
-    held = stages.optimiser.poses_held
-    if first is not None and not (stages.adjusts_again and _time_to_adjust_again(stages)):
+    held, again = stages.optimiser.poses_held, stages.record.adjusts_again and _time_to_adjust_again(stages)
+    if first is not None and not again:
         return first
-    last = adjust_cameras(stages)
+    if not again and not stages.record.believed:
+        return Finish(stages.record.candidates)
+    last = adjust_cameras(stages, moves=again)
     # The poses that are held are what the first adjustment made of the field's.
-    return replace(last, candidates=first.candidates) if first is not None and held and last.kept else last
+    chosen_then = not again or (held and last.kept)
+    return replace(last, candidates=stages.record.candidates) if chosen_then else last
 
 
 def _is_over(stages: TwoStages, first: Finish) -> bool:

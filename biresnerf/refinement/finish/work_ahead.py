@@ -65,7 +65,9 @@ def work_ahead(
     return {
         "coarse": coarse * weights["coarse"],
         "fine": fine * weights["fine"],
-        **after_steps(options, unbounded, adjusting=(first + stages.adjusts_again) * each, checks=checks),
+        **after_steps(
+            options, unbounded, adjusting=(first + stages.record.adjusts_again) * each, checks=checks
+        ),
     }
 
 

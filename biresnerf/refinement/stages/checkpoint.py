@@ -23,7 +23,7 @@ from biresnerf.refinement.lost.lost_cameras import RepairState
 from biresnerf.refinement.optimise.optimiser_state import StepState
 from biresnerf.refinement.stages.best_so_far import BestSoFar
 from biresnerf.refinement.stages.stability import DetectorState
-from biresnerf.report import SwitchReason
+from biresnerf.report import CandidateReport, SwitchReason
 
 CHECKPOINT = Path("checkpoint") / "latest.safetensors"
 SEEDING = CHECKPOINT.with_name("seeding.json")  # COLMAP's result; every checkpoint carries a copy
@@ -55,6 +55,9 @@ class RunRecord(FrozenModel, arbitrary_types_allowed=True):
         resumed: how often.
         switch_reason: why stage 2 began.
         adjusted: whether all cameras were adjusted on the way through stage 2.
+        candidates: the poses that were compared then.
+        believed: whether the evidence of then is believed.
+        adjusts_again: whether cameras are adjusted after the last step, too.
         best: the poses to offer before the end; None while none were better than the input's.
         seconds: spent in each part of the run.
     """
@@ -62,6 +65,9 @@ class RunRecord(FrozenModel, arbitrary_types_allowed=True):
     resumed: int = 0
     switch_reason: SwitchReason | None = None
     adjusted: bool = False
+    candidates: tuple[CandidateReport, ...] = ()
+    believed: bool = False
+    adjusts_again: bool = True
     best: BestSoFar | None = None
     seconds: dict[str, float] = Field(default_factory=lambda: {"coarse": 0.0, "fine": 0.0})
 

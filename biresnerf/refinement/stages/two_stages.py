@@ -55,7 +55,6 @@ class TwoStages:
         plan: called when it is known how long the steps of a stage take, after cameras were adjusted, and at each
             check of stage 2; it may change how many steps the run takes.
         ends: of `time.monotonic`, when the run is to end.
-        adjusts_again: whether cameras are adjusted after the last step, too.
     """
 
     def __init__(
@@ -71,7 +70,7 @@ class TwoStages:
         self.monitor, self.observer = monitor or Monitor(), observer
         self.forecast = self.monitor.forecast
         self.plan: Callable[[TwoStages], None] = lambda _stages: None
-        self.ends, self.adjusts_again = math.inf, True
+        self.ends = math.inf
         self.record, self.history = RunRecord(), History(folder)
         self.repair = LostCameraRepair(optimiser, OwnMatches.of(scene))
         self.detector = StabilityDetector(0, 0, guarded=optimiser.method.robust_extensions)

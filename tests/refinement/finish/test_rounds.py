@@ -76,16 +76,42 @@ def test_poses_go_on_with_the_field_to_the_last_step_where_no_evidence_tells(tmp
     assert not run.optimiser.poses_held
 
 
-def test_a_run_resumed_after_the_first_adjustment_ends_at_the_same_poses(tmp_path, rng):
+def test_a_run_resumed_after_the_first_adjustment_ends_and_reports_as_an_uninterrupted_one(tmp_path, rng):
     run, _ = stages(tmp_path / "once", rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3))
     run.run_stage_1()
-    run_stage_2(run)
+    whole = run_stage_2(run)
     again = TwoStages(
         tiny_optimiser(run.scene.dataset, run.scene.images, tiny_options()), run.scene, run.folder
     )
     again.restore(load_checkpoint(run.folder))
     assert again.optimiser.schedule.steps == run.optimiser.step_index
-    run_stage_2(again)
+    resumed = run_stage_2(again)
+    torch.testing.assert_close(again.optimiser.poses.poses(), run.optimiser.poses.poses())
+    assert [each.name for each in whole.candidates if each.chosen] == ["adjusted-tracks"]
+    assert resumed.candidates == whole.candidates
+    assert again.record.model_copy(update={"resumed": 0, "seconds": {}}) == run.record.model_copy(
+        update={"seconds": {}}
+    )
+    assert again.optimiser.lenses.certainty == run.optimiser.lenses.certainty
+
+
+@pytest.mark.parametrize("believed", [True, False])
+def test_a_run_resumed_without_time_to_adjust_again_reports_what_the_first_adjustment_found(
+    tmp_path, rng, believed
+):
+    run, _ = stages(tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3))
+    run.run_stage_1()
+    run.ends = 0.0
+    first = run_stage_2(run)
+    assert first.fit is not None
+    again = TwoStages(
+        tiny_optimiser(run.scene.dataset, run.scene.images, tiny_options()), run.scene, run.folder
+    )
+    again.restore(load_checkpoint(run.folder))
+    again.ends, again.record = 0.0, again.record.model_copy(update={"believed": believed})
+    resumed = run_stage_2(again)
+    assert resumed.candidates == first.candidates
+    assert (resumed.fit is not None) is believed
     torch.testing.assert_close(again.optimiser.poses.poses(), run.optimiser.poses.poses())
 
 
@@ -95,7 +121,9 @@ def test_cameras_are_adjusted_again_only_where_there_is_time(tmp_path, rng, monk
     run, _ = stages(tmp_path, rng, refined=0.0, noise_px=0.3)
     run.run_stage_1()
     run.ends, calls = ends, []
-    monkeypatch.setattr(rounds, "adjust_cameras", lambda run: calls.append(run) or adjust_cameras(run))
+    monkeypatch.setattr(
+        rounds, "adjust_cameras", lambda run, **how: calls.append(run) or adjust_cameras(run, **how)
+    )
     run_stage_2(run)
     assert run.optimiser.step_index == run.optimiser.options.steps
     assert len(calls) == adjusted
@@ -112,7 +140,7 @@ def test_an_adjustment_that_was_planned_for_is_not_left_out_for_a_moment(
     run.optimiser.options = run.optimiser.options.model_copy(update={"time_budget_s": budget_s})
     adjustments: list[float] = []
 
-    def refused(run):
+    def refused(run, **_how):
         adjustments.append(run.optimiser.step_index)
         run.ends = time.monotonic() + 100 - late_s
         return Finish()

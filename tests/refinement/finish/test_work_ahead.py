@@ -50,7 +50,7 @@ def test_what_was_adjusted_once_is_adjusted_once_more_and_not_checked_again(stag
     after = work_ahead(stages)
     assert after["adjusting"] == before["adjusting"] / 2
     assert after["checking"] == 0
-    stages.adjusts_again = False
+    stages.record = stages.record.model_copy(update={"adjusts_again": False})
     assert work_ahead(stages)["adjusting"] == 0
 
 
