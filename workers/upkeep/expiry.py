@@ -152,7 +152,9 @@ class Expiry:
             "DELETE FROM datasets WHERE state = 'expired'"
             " AND expires_at < now() - make_interval(secs => %s)"
             " AND NOT EXISTS (SELECT 1 FROM dataset_jobs WHERE dataset_id = datasets.id)",
-            "DELETE FROM webhook_deliveries WHERE finished_at < now() - make_interval(secs => %s)",
+            # Waits for nobody: deleting a webhook locks the same rows in another order.
+            "DELETE FROM webhook_deliveries WHERE id IN (SELECT id FROM webhook_deliveries"
+            " WHERE finished_at < now() - make_interval(secs => %s) FOR UPDATE SKIP LOCKED)",
         ):
             await self._database.fetch(sql, old_s)
 

@@ -154,11 +154,15 @@ class WebhookSender:
         self, connection: Connection, row: dict[str, Any], result: Result, at: datetime, seconds: float
     ) -> None:
         """Record the outcome. The state of the message changes only while the lease is ours."""
+        # First the webhook, then its messages: who deletes it locks them in this order.
+        lock = "SELECT 1 FROM webhooks WHERE id = %s FOR NO KEY UPDATE"
+        if await connection.row(lock, row["webhook_id"]) is None:
+            return
         written = await connection.row(
             "UPDATE webhook_deliveries SET attempts = attempts + 1 WHERE id = %s RETURNING attempts",
             row["id"],
         )
-        if written is None:  # deleted meanwhile, with its webhook
+        if written is None:  # deleted meanwhile
             return
         await connection.execute(
             "INSERT INTO webhook_attempts (delivery_id, number, at, seconds, status, error)"

@@ -22,6 +22,7 @@ from workers.webhooks.outbound import Policy, checked_url
 
 ROTATION_HOURS = 24
 TEST_EVENT = "webhook.test"
+TESTS_A_MINUTE = 10
 _MINE = "tenant = coalesce(%s, tenant)"
 _DELIVERY = """
     SELECT webhook_deliveries.*, (SELECT coalesce(jsonb_agg(to_jsonb(attempt) - 'delivery_id' ORDER BY number), '[]')
@@ -124,7 +125,10 @@ class WebhookStore(OwnedStore):
             await connection.required_row(f"No webhook {webhook_id}.", sql, webhook_id, self._tenant)
 
     async def test(self, webhook_id: str) -> DeliveryView:
-        """Queue a message ``webhook.test``; raises `NotFound`, `Conflict` (``state_conflict``)."""
+        """Queue a message ``webhook.test``.
+
+        Raises `NotFound`, `Conflict` (``state_conflict``), `LimitReached` (``rate_limited``).
+        """
         delivery_id = new_id("msg")
         message = {
             "type": TEST_EVENT,
@@ -133,6 +137,14 @@ class WebhookStore(OwnedStore):
         }
         async with self._database.transaction() as connection:
             await self._require_enabled(connection, webhook_id)
+            recent = (
+                "SELECT count(*) FROM webhook_deliveries WHERE webhook_id = %s AND event = %s"
+                " AND created_at > clock_timestamp() - interval '1 minute'"
+            )
+            if await connection.value(recent, webhook_id, TEST_EVENT) >= TESTS_A_MINUTE:
+                raise LimitReached(
+                    "rate_limited", f"A webhook is tested {TESTS_A_MINUTE} times a minute at most."
+                )
             await connection.execute(
                 "INSERT INTO webhook_deliveries (id, webhook_id, event, body) VALUES (%s, %s, %s, %s)",
                 (delivery_id, webhook_id, TEST_EVENT, json.dumps(message)),

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
+from datetime import UTC, datetime
+
 import psycopg
 import pytest
 import standardwebhooks
@@ -14,10 +17,11 @@ from tests.workers.webhooks.webhook_receiver import (
     concluded,
     queued_job,
 )
-from workers.database.database import open_database
+from workers.database.database import Database, open_database
 from workers.engine import Stores
 from workers.settings.errors import LimitReached, NotFound
 from workers.settings.settings import Settings
+from workers.webhooks.webhook_sender import Result, WebhookSender
 
 pytestmark = pytest.mark.anyio
 
@@ -135,3 +139,71 @@ async def test_a_tenant_has_so_many_webhooks_and_no_more(settings: Settings, sto
         with pytest.raises(LimitReached) as told:
             await store.create("local", "http://127.0.0.1:9999/", ["job.failed"])
         assert told.value.code == "too_many_webhooks"
+
+
+async def waiting_for_locks(database: Database, count: int) -> None:
+    sql = "SELECT count(*) AS n FROM pg_stat_activity WHERE wait_event_type = 'Lock' AND pid <> pg_backend_pid()"
+    async with asyncio.timeout(30):
+        while (await database.fetch(sql))[0]["n"] < count:
+            await asyncio.sleep(0.05)
+
+
+async def test_a_webhook_is_deleted_while_the_outcome_of_its_message_is_written_down(
+    stores: Stores, settings: Settings
+):
+    webhook, _ = await stores.webhooks.create("local", "http://127.0.0.1:9/in", ALL_EVENTS)
+    await stores.webhooks.test(webhook.id)
+    async with open_database(settings.require_database_url()) as database:
+        sender = WebhookSender(database, None, None, settings)  # type: ignore[arg-type]
+        (row,) = await sender._claim(1)
+        failed = Result("again", error="connection_failed")
+
+        async def conclude() -> None:
+            async with database.transaction() as connection:
+                await sender._conclude(connection, row, failed, datetime.now(UTC), 0.1)
+
+        async with database.transaction() as holder:
+            # The outcome is half written down when the deletion begins.
+            await holder.execute("LOCK TABLE webhook_attempts IN EXCLUSIVE MODE")
+            concluding = asyncio.create_task(conclude())
+            await waiting_for_locks(database, 1)
+            deleting = asyncio.create_task(stores.webhooks.delete(webhook.id))
+            await waiting_for_locks(database, 2)
+        assert await asyncio.gather(concluding, deleting, return_exceptions=True) == [None, None]
+        with pytest.raises(NotFound):
+            await stores.webhooks.get(webhook.id)
+        await conclude()  # of what is deleted by now
+
+
+async def test_behind_a_thousand_messages_that_wait_others_fail_at_once_and_can_be_sent_again(
+    stores: Stores, settings: Settings
+):
+    webhook, _ = await stores.webhooks.create("local", "http://127.0.0.1:9/in", ALL_EVENTS)
+    other, _ = await stores.webhooks.create("local", "http://127.0.0.1:9/other", ALL_EVENTS)
+    with psycopg.connect(settings.require_database_url()) as connection:
+        connection.execute(
+            "INSERT INTO webhook_deliveries (id, webhook_id, event, body)"
+            " SELECT 'msg_' || n, %s, 'job.queued', '{}' FROM generate_series(1, 999) AS n",
+            (webhook.id,),
+        )
+    await queued_job(stores)
+    newest = (await stores.webhooks.deliveries(webhook.id, limit=2)).items
+    assert {(one.event, one.state) for one in newest} == {
+        ("dataset.validated", "pending"),
+        ("job.queued", "failed"),
+    }
+    (late,) = [one for one in newest if one.state == "failed"]
+    assert (late.attempts, late.next_attempt_at) == ((), None)
+    assert {one.state for one in (await stores.webhooks.deliveries(other.id)).items} == {"pending"}
+    assert (await stores.webhooks.redeliver(webhook.id, late.id)).state == "pending"
+
+
+async def test_a_webhook_is_tested_ten_times_a_minute_at_most(stores: Stores):
+    webhook, _ = await stores.webhooks.create("local", "http://127.0.0.1:9/in", ALL_EVENTS)
+    other, _ = await stores.webhooks.create("local", "http://127.0.0.1:9/other", ALL_EVENTS)
+    for _ in range(10):
+        await stores.webhooks.test(webhook.id)
+    with pytest.raises(LimitReached) as caught:
+        await stores.webhooks.test(webhook.id)
+    assert caught.value.code == "rate_limited"
+    await stores.webhooks.test(other.id)

@@ -155,14 +155,16 @@ CREATE FUNCTION rfc3339(_at timestamptz) RETURNS text LANGUAGE sql STABLE AS $$
     SELECT to_char(_at AT TIME ZONE 'UTC', 'YYYY-MM-DD"T"HH24:MI:SS.US"Z"')
 $$;
 
--- One message for each webhook of the tenant that wants the event. `_job_id` is none where it is about no job.
+-- One message for each webhook of the tenant that wants the event; behind 1000 that wait it has failed at once. `_job_id` is none where it is about no job.
 CREATE FUNCTION queue_webhooks(_tenant text, _job_id text, _event text, _at timestamptz, _data jsonb)
 RETURNS void LANGUAGE plpgsql AS $$
 BEGIN
-    INSERT INTO webhook_deliveries (id, webhook_id, event, body)
+    INSERT INTO webhook_deliveries (id, webhook_id, event, body, state, finished_at)
     SELECT 'msg_' || replace(gen_random_uuid()::text, '-', ''), hook.id, _event,
-        jsonb_build_object('type', _event, 'timestamp', rfc3339(_at), 'data', _data)::text
-    FROM webhooks AS hook
+        jsonb_build_object('type', _event, 'timestamp', rfc3339(_at), 'data', _data)::text,
+        CASE WHEN waiting.full THEN 'failed' ELSE 'pending' END, CASE WHEN waiting.full THEN clock_timestamp() END
+    FROM webhooks AS hook CROSS JOIN LATERAL (SELECT count(*) >= 1000 AS full FROM (
+        SELECT FROM webhook_deliveries WHERE webhook_id = hook.id AND state = 'pending' LIMIT 1000) AS first) AS waiting
     WHERE hook.tenant = _tenant AND hook.enabled AND _event = ANY (hook.events)
         AND (hook.job_id IS NULL OR hook.job_id = _job_id);
     IF FOUND THEN
