@@ -12,7 +12,7 @@ from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.uncertainty import ControlReport, GeoReference, InputAccuracy, KnownScale, PoseUncertainty
 
 SwitchReason = Literal["stable", "cap"]
-IntrinsicsSource = Literal["given", "exif", "predicted", "colmap", "guessed", "refined"]
+IntrinsicsSource = Literal["given", "maker", "exif", "predicted", "colmap", "guessed", "refined"]
 PoseSource = Literal[
     "given", "colmap", "matches-incremental", "matches-global", "neighbours", "nearest-view", "forward-facing",
     "turntable", "gimbal",

@@ -13,6 +13,7 @@ from biresnerf.data.model.part_of_set import with_frames
 from biresnerf.data.photos.image_files import ImageHeader, read_header
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera, FullParameters
+from biresnerf.geometry.camera.lens import lens_problem
 
 GUESSED_FOCAL = 1.2  # of the long side, as COLMAP guesses: a field of view of 45 degrees, a normal lens
 FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
@@ -27,16 +28,42 @@ LEAST_SIDE = 16  # px; in smaller photos the first pixel is no corner
 
 
 def guess_lens(header: ImageHeader) -> tuple[Camera, IntrinsicsSource]:
-    """A SIMPLE_RADIAL camera for the stored picture, without distortion, and where its focal length comes from."""
+    """A camera for the stored picture, and where it comes from.
+
+    It is as the drone's maker measured it, where the picture's XMP says so and EXIF agrees. Else it is SIMPLE_RADIAL,
+    without distortion.
+    """
     width, height = header.width, header.height
     focal = exif_focal_px(header)
+    measured = _as_its_maker_measured(header, focal)
+    if measured is not None:
+        return measured, "maker"
     source: IntrinsicsSource = "guessed" if focal is None else "exif"
     focal = GUESSED_FOCAL * max(width, height) if focal is None else focal
     return Camera("SIMPLE_RADIAL", width, height, (focal, width / 2, height / 2, 0.0)), source
 
 
+def _as_its_maker_measured(header: ImageHeader, exif_px: float | None) -> Camera | None:
+    """None where EXIF's focal length shows that another picture was measured, or where no lens is like that."""
+    lens = header.maker_lens
+    if lens is None:
+        return None
+    scale = header.width / lens.width if lens.width else 1.0
+    fx, fy, cx, cy = (scale * each for each in lens[1:5])
+    if not all(_plausible(focal, header) for focal in (fx, fy)):
+        return None
+    if exif_px is not None and abs(math.sqrt(fx * fy) / exif_px - 1) > AGREE:
+        return None
+    place = header.width / 2 + cx, header.height / 2 + cy
+    bent = lens.k1, lens.k2, lens.p1, lens.p2, lens.k3
+    camera = Camera("FULL_OPENCV", header.width, header.height, (fx, fy, *place, *bent, 0.0, 0.0, 0.0))
+    return None if lens_problem(camera.full(), camera.width, camera.height) else camera
+
+
 def guess_note(source: IntrinsicsSource) -> str:
     """A note for the user on a lens that is not given."""
+    if source == "maker":
+        return "no intrinsics are given: the lens is as its maker measured it, by the photos' XMP"
     found = {"exif": "taken from EXIF", "predicted": "what a network predicted"}.get(source, "a guess")
     return f"no intrinsics are given: the focal length is {found}"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 import warnings
 import zlib
@@ -24,6 +25,7 @@ from biresnerf.data.photos.kinds.photo_kinds import (
     install_hint,
     is_readable,
 )
+from biresnerf.data.photos.kinds.xmp import xmp, xmp_number, xmp_text
 from biresnerf.data.photos.panoramas.panorama import says_equirectangular
 from biresnerf.errors import InputError
 
@@ -65,6 +67,25 @@ class FocalPlane(NamedTuple):
     height: int
 
 
+class MakerLens(NamedTuple):
+    """A drone's lens as its maker measured it, in OpenCV's model; px of a picture of `width` px (0: of this one).
+
+    Attributes:
+        cx, cy: of the principal point, from the middle of the picture.
+    """
+
+    width: float
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    k1: float
+    k2: float
+    p1: float
+    p2: float
+    k3: float
+
+
 class ImageHeader(NamedTuple):
     """The header of a stored picture; EXIF values are unchecked but positive.
 
@@ -79,6 +100,7 @@ class ImageHeader(NamedTuple):
         taken_with: make, model and serial number of the camera, model and serial number of its lens, and the focal
             length (mm): photos that differ in them have lenses that differ.
         equirectangular: its XMP calls it a panorama of this projection.
+        maker_lens: its XMP's, of the picture as stored.
     """
 
     width: int
@@ -91,6 +113,7 @@ class ImageHeader(NamedTuple):
     equirectangular: bool = False
     sixteen_bit: bool = False
     taken_with: tuple[str, ...] = ()
+    maker_lens: MakerLens | None = None
 
 
 @contextmanager
@@ -275,8 +298,26 @@ def header_of(image: Image.Image) -> ImageHeader:
         several=_holds_several(image),
         equirectangular=says_equirectangular(image),
         sixteen_bit=is_sixteen_bit(image),
+        maker_lens=_maker_lens(xmp(image)),
     )
     return from_exif(image, lambda exif: _with_exif(header, exif)) or header
+
+
+def _maker_lens(text: bytes) -> MakerLens | None:
+    """DJI's ``DewarpData`` (manuals of Mavic 3M and Matrice 4), if the picture still has this distortion.
+
+    It is "date;fx,fy,cx,cy,k1,k2,p1,p2,k3".
+    """
+    said = xmp_text(text, "drone-dji:DewarpData")
+    if said is None or xmp_number(text, "drone-dji:DewarpFlag") == 1:
+        return None
+    try:
+        numbers = [float(number) for number in said.rpartition(";")[2].split(",")]
+    except ValueError:
+        return None
+    if len(numbers) != len(MakerLens._fields) - 1 or not all(map(math.isfinite, numbers)):
+        return None
+    return MakerLens(2 * (xmp_number(text, "drone-dji:CalibratedOpticalCenterX") or 0.0), *numbers)
 
 
 def from_exif(image: Image.Image, read: Callable[[Image.Exif], T]) -> T | None:

@@ -59,7 +59,7 @@ def turned_header(header: ImageHeader, orientation: int) -> ImageHeader:
     plane = header.focal_plane
     if plane is not None and orientation >= 5:
         plane = FocalPlane(plane.px_per_mm_y, plane.px_per_mm_x, plane.height, plane.width)
-    return header._replace(width=width, height=height, orientation=1, focal_plane=plane)
+    return header._replace(width=width, height=height, orientation=1, focal_plane=plane, maker_lens=None)
 
 
 def meant_orientations(

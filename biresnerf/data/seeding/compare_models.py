@@ -49,10 +49,11 @@ def model_lens_problem(dataset: Dataset, model: MappedModel) -> str | None:
 
 def with_found_lenses(dataset: Dataset, models: list[MappedModel]) -> Dataset:
     """The first model's lenses in place of guessed ones."""
-    if not models or all(known_intrinsics(dataset)):
+    known = known_intrinsics(dataset)
+    if not models or all(known):
         return dataset
     cameras, sources = list(dataset.cameras), list(dataset.intrinsics_sources)
     for i, camera in models[0].cameras.items():
-        if sources[i] != "given":
+        if not known[i]:
             cameras[i], sources[i] = camera, "colmap"
     return replace(dataset, cameras=tuple(cameras), intrinsics_sources=tuple(sources))

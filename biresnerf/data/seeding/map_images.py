@@ -100,10 +100,10 @@ class Mapping:
 
 
 def known_intrinsics(dataset: Dataset) -> list[bool]:
-    """Whether each camera's intrinsics are the user's own, which COLMAP then leaves alone."""
+    """Whether each camera's intrinsics are the user's own or their maker's, which COLMAP then leaves alone."""
     if not dataset.intrinsics_sources:
         return [True] * len(dataset.cameras)
-    return [source == "given" for source in dataset.intrinsics_sources]
+    return [source in ("given", "maker") for source in dataset.intrinsics_sources]
 
 
 def ask_colmap(

@@ -25,7 +25,7 @@ MAX_DISTORTION = 1.5
 MIN_MAGNIFICATION = 0.1
 _BORDER_POINTS_PER_EDGE = 8
 _STEPS_OUTWARD = 24
-_NEWTON_STEPS = 3
+_NEWTON_STEPS = 8  # near a fold they converge slowly
 # In focal lengths: two ways to one position, and a pixel and what its direction is projected to.
 _SAME, _EXACT = 1e-5, 1e-11
 

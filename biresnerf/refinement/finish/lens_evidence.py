@@ -32,10 +32,10 @@ Array = NDArray[np.float64]
 
 # Standard deviation of a focal length, as a share of it, by who found it. Guesses: over 13 sets of photos of all kinds,
 # the logarithm of the focal length over the guess (1.2 of the long side) has 0.4. What COLMAP found says nothing
-# before: it is of the same matches; what a network predicts counts as a guess. EXIF: whole millimetres of 35 mm film,
-# and what stabilisation cuts off.
+# before: it is of the same matches; what a network predicts counts as a guess, what a maker measured as given. EXIF:
+# whole millimetres of 35 mm film, and what stabilisation cuts off.
 FOCAL_DEVIATION: dict[IntrinsicsSource, float] = {
-    "given": 0.02, "exif": 0.05, "predicted": 0.4, "colmap": 0.4, "guessed": 0.4
+    "given": 0.02, "maker": 0.02, "exif": 0.05, "predicted": 0.4, "colmap": 0.4, "guessed": 0.4
 }  # fmt: skip
 # Of distortion, as it moves the image's corner, as a share of its distance.
 RADIAL_DEVIATION, TANGENTIAL_DEVIATION = 0.1, 0.01

@@ -14,6 +14,7 @@ const MARKS: Record<Mark, [string, string]> = {
 };
 const INTRINSICS: Record<string, string> = {
   given: "given",
+  maker: "as the drone's maker measured them",
   exif: "from EXIF",
   predicted: "predicted by a network, and refined with the poses",
   colmap: "from COLMAP",

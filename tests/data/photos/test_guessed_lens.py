@@ -11,7 +11,7 @@ from PIL.PngImagePlugin import PngInfo
 
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.photos.guessed_lens import exif_focal_px, guess_lens
-from biresnerf.data.photos.image_files import FocalPlane, ImageHeader
+from biresnerf.data.photos.image_files import FocalPlane, ImageHeader, MakerLens, read_header
 from biresnerf.errors import InputError
 from tests.data.formats.simple import trajectories
 from tests.data.scenes import assert_complete, nerfstudio_scene, save
@@ -47,6 +47,68 @@ def test_what_no_lens_has_is_not_believed(focal):
     camera, source = guess_lens(ImageHeader(600, 400, focal_35mm=focal))
     assert source == "guessed"
     assert camera.params == (1.2 * 600, 300.0, 200.0, 0.0)
+
+
+# A Phantom 4 RTK's, as its owner published it.
+MEASURED = (3659.78, 3653.17, -7.71, 45.9, -0.269478, 0.115681, -8.75619e-5, -0.000306177, -0.0357628)
+DRONE = ImageHeader(5472, 3648, focal_35mm=24.0, maker_lens=MakerLens(5472.0, *MEASURED))
+
+
+def xmp_of_drone(numbers: str, *more: str) -> bytes:
+    said = " ".join((f'drone-dji:DewarpData="{numbers}"', *more))
+    return f'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description {said}/></x:xmpmeta>'.encode()
+
+
+def lens_by(tmp_path: Path, xmp: bytes) -> MakerLens | None:
+    Image.new("RGB", (60, 40)).save(tmp_path / "drone.jpg", xmp=xmp)
+    return read_header(tmp_path / "drone.jpg", "drone.jpg").maker_lens
+
+
+@pytest.mark.parametrize("middle", ["", 'drone-dji:CalibratedOpticalCenterX="2736.000000"'])
+def test_a_drones_photo_has_the_lens_that_its_maker_measured(tmp_path, middle):
+    numbers = "2018-03-13;" + ", ".join(map(str, MEASURED))
+    found = lens_by(tmp_path, xmp_of_drone(numbers, 'drone-dji:DewarpFlag="0"', middle))
+    assert found == MakerLens(5472.0 if middle else 0.0, *MEASURED)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "flag"),
+    [
+        ("2018-03-13;" + ",".join(map(str, MEASURED)), 1),  # undistorted already
+        ("2018-03-13;" + ",".join(map(str, MEASURED[:8])), 0),
+        ("2018-03-13;3659.78,nan,0,0,0,0,0,0,0", 0),
+        ("", 0),
+    ],
+    ids=["undistorted", "too few", "not a number", "empty"],
+)
+def test_other_numbers_of_a_maker_are_no_lens(tmp_path, numbers, flag):
+    assert lens_by(tmp_path, xmp_of_drone(numbers, f'drone-dji:DewarpFlag="{flag}"')) is None
+
+
+def test_the_makers_lens_is_opencvs_about_the_middle_and_scales_with_the_picture():
+    camera, source = guess_lens(DRONE)
+    assert source == "maker"
+    fx, fy, cx, cy, k1, k2, p1, p2, k3 = MEASURED
+    full = (fx, fy, 2736 + cx, 1824 + cy, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
+    assert (camera.model, camera.params) == ("FULL_OPENCV", pytest.approx(full))
+    half, _ = guess_lens(DRONE._replace(width=2736, height=1824))
+    assert half.params[:4] == pytest.approx([each / 2 for each in full[:4]])
+    assert half.params[4:] == camera.params[4:]
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"focal_35mm": 35.0},  # a crop, or a zoom
+        {"maker_lens": MakerLens(0.0, 3659.78, 3653.17, 0, 0, -0.9, 0, 0, 0, 0)},  # folds back
+        {"maker_lens": MakerLens(0.0, 0.0, 0.0, 0, 0, 0, 0, 0, 0, 0)},
+        {"maker_lens": MakerLens(0.0, 3659.78, -3653.17, 0, 0, 0, 0, 0, 0, 0)},
+    ],
+    ids=["another focal length", "no lens", "zeros", "mirrored"],
+)
+def test_a_makers_lens_that_cannot_be_the_pictures_is_left_to_exif(changed):
+    camera, source = guess_lens(DRONE._replace(**changed))
+    assert (camera.model, source) == ("SIMPLE_RADIAL", "exif")
 
 
 def write_jpeg(path: Path, focal_35mm: int | None) -> None:

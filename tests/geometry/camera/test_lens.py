@@ -49,6 +49,13 @@ def test_real_lenses_pass(coefficients):
     assert lens_problem(FullParameters(500, 500, 320, 240, *coefficients), WIDTH, HEIGHT) is None
 
 
+def test_a_drones_lens_that_is_nearly_steep_enough_to_fold_in_the_corner_passes():
+    """A Phantom 4 RTK's, as its maker measured it: the corner's area is seen at an eighth of the middle's."""
+    radial_and_tangential = (-0.269478, 0.115681, -8.75619e-5, -0.000306177, -0.0357628)
+    drone = FullParameters(3659.78, 3653.17, 2728.29, 1869.9, *radial_and_tangential)
+    assert lens_problem(drone, 5472, 3648) is None
+
+
 @pytest.mark.parametrize(
     ("coefficients", "words"),
     [

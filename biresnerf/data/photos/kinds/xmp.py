@@ -15,6 +15,12 @@ def xmp(image: Image.Image) -> bytes:
     return b"".join(t.encode() if isinstance(t, str) else t for t in texts if isinstance(t, str | bytes))
 
 
+def xmp_text(text: bytes, name: str) -> str | None:
+    """A property (``prefix:Name``), as an attribute or an element."""
+    found = re.search(rb"\b%s(?:\s*=\s*[\"']|>)\s*([^\"'<]+)" % name.encode(), text)
+    return found[1].decode("utf-8", "replace").strip() if found else None
+
+
 def xmp_number(text: bytes, *names: str) -> float | None:
     """The first of these properties (``prefix:Name``) that is a number, as an attribute or an element."""
     for name in names:
