@@ -21,6 +21,6 @@ def require_shown(job_id: str, method: str, path: str) -> None:
 
 def shown_to_strangers(job: JobView) -> JobView:
     """The job without its tenant, labels, dataset, and the jobs that it was made from."""
-    unnamed = {"tenant": "", "labels": {}, "parent": None, "forked_from": None, "fixed_from": None}
     links = job.links.model_copy(update={"dataset": ""})
-    return job.model_copy(update={**unnamed, "dataset_id": "", "links": links})
+    owners = {"tenant": "", "labels": {}, "dataset_id": "", "links": links}
+    return job.model_copy(update={**owners, "parent": None, "forked_from": None, "fixed_from": None})
