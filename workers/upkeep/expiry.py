@@ -31,17 +31,24 @@ from workers.store.trash import discard
 log = logging.getLogger(__name__)
 
 BATCH = 100
+# A dataset that is locked is in use, and looked at again. Submits share its lock: where they overlap without a gap,
+# who waits for them would wait for ever.
+_UNUSED = "SELECT 1 FROM datasets WHERE id = %s FOR UPDATE SKIP LOCKED"
 # One dispatcher at a time keeps the dates up and deletes; the others have webhooks to send.
 EXPIRY_LOCK = 7_201_606
 _DATE_DATASETS = """
     UPDATE datasets SET expires_at = due.at FROM (
-        SELECT id, CASE WHEN coalesce(unfinished, 0) = 0 THEN
-            greatest(touched_at, used_at) + make_interval(secs => %(kept_s)s) END AS at
-        FROM datasets LEFT JOIN (SELECT * FROM dataset_jobs {used}) AS used ON dataset_id = id
-        WHERE state IN ('open', 'ready', 'rejected') {dated}) AS due
-    WHERE due.id = datasets.id AND datasets.expires_at IS DISTINCT FROM due.at"""
+        SELECT kept.id, date.at FROM datasets AS kept
+        LEFT JOIN (SELECT * FROM dataset_jobs {used}) AS used ON dataset_id = kept.id
+        CROSS JOIN LATERAL (SELECT CASE WHEN coalesce(unfinished, 0) = 0 THEN
+            greatest(touched_at, used_at) + make_interval(secs => %(kept_s)s) END AS at) AS date
+        WHERE state IN ('open', 'ready', 'rejected') {dated} AND kept.expires_at IS DISTINCT FROM date.at
+        FOR NO KEY UPDATE OF kept SKIP LOCKED) AS due
+    WHERE due.id = datasets.id"""
 _DATE_ALL = _DATE_DATASETS.format(used="", dated="")
-_DATE_CHANGED = _DATE_DATASETS.format(used="WHERE dataset_id = ANY(%(ids)s)", dated="AND id = ANY(%(ids)s)")
+_DATE_CHANGED = _DATE_DATASETS.format(
+    used="WHERE dataset_id = ANY(%(ids)s)", dated="AND kept.id = ANY(%(ids)s)"
+)
 # All dates are looked over so often: a setting may have changed, a job's record may be gone.
 ALL_S = 3600.0
 # Changes of so long ago are looked at again: their transaction may have ended after the last round.
@@ -107,15 +114,15 @@ class Expiry:
             " AND state IN ('open', 'ready', 'rejected') ORDER BY expires_at LIMIT %s",
             BATCH,
         )
-        for row in rows:
-            await self._expire_dataset(row["id"])
-        return len(rows)
+        return sum([await self._expire_dataset(row["id"]) for row in rows])
 
-    async def _expire_dataset(self, dataset_id: str) -> None:
+    async def _expire_dataset(self, dataset_id: str) -> bool:
+        """Whether it is looked after: not where it is in use at this moment."""
         kept_s = self._settings.keep_datasets_days * DAY_S
         async with self._database.transaction() as connection:
             # The lock first: a submit that came before it is seen by the next statement, one after it sees us.
-            await connection.execute("SELECT 1 FROM datasets WHERE id = %s FOR UPDATE", (dataset_id,))
+            if await connection.row(_UNUSED, dataset_id) is None:
+                return False
             row = await connection.row(
                 "UPDATE datasets SET state = 'expired', revision = revision + 1 WHERE id = %s"
                 " AND state IN ('open', 'ready', 'rejected') AND expires_at <= clock_timestamp()"
@@ -131,7 +138,7 @@ class Expiry:
             )
             if row is None:
                 await connection.execute("UPDATE datasets SET expires_at = NULL WHERE id = %s", (dataset_id,))
-                return
+                return True
             what = await connection.row(
                 "WITH gone AS (DELETE FROM dataset_files WHERE dataset_id = %s RETURNING size)"
                 " SELECT count(*) AS files, coalesce(sum(size), 0)::bigint AS bytes FROM gone",
@@ -140,6 +147,7 @@ class Expiry:
             await connection.execute("DELETE FROM uploads WHERE dataset_id = %s", (dataset_id,))
             await discard(connection, f"datasets/{dataset_id}")
         log.info("expired %s of %s, unused: %s", dataset_id, row["tenant"], what)
+        return True
 
     async def _forget(self) -> None:
         """Idempotency keys a while after their jobs; then the records of what expired, and of deliveries."""

@@ -15,6 +15,7 @@ from biresnerf.options.refine_options import RefineOptions
 from tests.workers.conftest import ready_dataset
 from workers.database.database import open_database
 from workers.engine import Stores
+from workers.jobs.quotas import submitting_for
 from workers.settings.errors import Conflict, Expired, NotFound
 from workers.settings.settings import Settings
 from workers.store.trash import empty_trash
@@ -265,3 +266,40 @@ async def until(holds: Callable[[], Awaitable[bool]]) -> None:
     while not await holds():
         assert time.monotonic() < end, "waited too long"
         await asyncio.sleep(0.05)
+
+
+async def test_submits_without_a_gap_keep_no_other_dataset_from_its_date_and_its_end(
+    settings: Settings, stores: Stores
+):
+    busy, due, dated = [await ready_dataset(stores, PLAN) for _ in range(3)]
+    await rounds(settings, stores)
+    for dataset in (busy, due):
+        aged(settings, "datasets", dataset, settings.keep_datasets_days + 1)
+    with psycopg.connect(settings.require_database_url()) as connection:
+        connection.execute("UPDATE datasets SET expires_at = now() WHERE id = ANY(%s)", ([busy, due],))
+        connection.execute("UPDATE datasets SET expires_at = NULL WHERE id = %s", (dated,))
+    going_on = asyncio.Event()
+
+    async def submits() -> None:
+        while going_on.is_set():
+            await stores.jobs.submit(busy, RefineOptions(preset="fast"))
+
+    url = settings.require_database_url()
+    async with open_database(url, answer_s=10.0) as database, open_database(url) as submitting:
+        # Submits of others that overlap: one has the lock at each moment.
+        async with submitting.transaction() as first:
+            await submitting_for(first, busy, None)
+            going_on.set()
+            more = [asyncio.create_task(submits()) for _ in range(3)]
+            await Expiry(database, settings).round()
+        await asyncio.sleep(0.2)
+        expiry = Expiry(database, settings)
+        for _ in range(3):
+            await expiry.round()
+        going_on.clear()
+        await asyncio.gather(*more)
+        assert (await stores.datasets.get(due)).state == "expired"
+        assert (await stores.datasets.get(dated)).expires_at is not None
+        await expiry.round()
+        assert (await stores.datasets.get(busy)).state == "ready"
+        assert (await stores.datasets.get(busy)).expires_at is None  # its jobs wait
