@@ -22,10 +22,17 @@ from workers.database.notifications import Listener
 from workers.engine import Stores
 from workers.settings.errors import Conflict
 from workers.settings.settings import Settings
+from workers.webhooks import webhooks
 from workers.webhooks.outbound import Outbound, Policy
 from workers.webhooks.webhook_sender import _CLAIM, WebhookSender, outcome_of, pause, retry_after
 
 pytestmark = pytest.mark.anyio
+
+
+@pytest.fixture
+def many_tests(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tests of webhooks are messages that need no job."""
+    monkeypatch.setattr(webhooks, "TESTS_A_MINUTE", 1000)
 
 
 async def test_a_failed_message_comes_again_later_and_later_under_the_same_id(
@@ -63,7 +70,7 @@ async def test_a_refusal_ends_it_until_it_is_asked_for_again(stores: Stores, dis
 
 
 async def test_dead_receivers_hold_up_neither_jobs_nor_other_receivers(
-    stores: Stores, settings: Settings, slots: Slots, dispatchers: Dispatchers
+    stores: Stores, settings: Settings, slots: Slots, dispatchers: Dispatchers, many_tests: None
 ):
     async with Receiver(None).open() as silent, Receiver().open() as alive:
         dead, _ = await stores.webhooks.create("local", silent.url, ALL_EVENTS)
@@ -81,7 +88,9 @@ async def test_dead_receivers_hold_up_neither_jobs_nor_other_receivers(
         assert (await stores.jobs.get(job_id)).state == "succeeded"
 
 
-async def test_two_dispatchers_send_each_message_once(stores: Stores, dispatchers: Dispatchers):
+async def test_two_dispatchers_send_each_message_once(
+    stores: Stores, dispatchers: Dispatchers, many_tests: None
+):
     async with Receiver().open() as receiver:
         webhook, _ = await stores.webhooks.create("local", receiver.url, ALL_EVENTS)
         ids = [(await stores.webhooks.test(webhook.id)).id for _ in range(40)]
