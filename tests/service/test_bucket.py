@@ -59,7 +59,7 @@ def test_a_job_leaves_nothing_on_local_disk_and_its_files_come_from_the_bucket(
             assert (tmp_path / "out/transforms.json").read_bytes() == there.content
             assert service.staging_is_empty()
         left = {path.relative_to(folder / "data").parts[0] for path in (folder / "data").rglob("*")}
-        assert left <= {"postgres", "scratch", "slots", "staging"}
+        assert left <= {"beats", "postgres", "scratch", "slots", "staging"}
         assert [path for path in (folder / "data/scratch").rglob("*") if path.is_file()] == []
         keys = [item["Key"] for item in by_boto(bucket).list_objects_v2(Bucket=bucket.name)["Contents"]]
         of_sets = [key for key in keys if "/datasets/" in key and "/shown/" not in key]

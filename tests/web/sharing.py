@@ -23,7 +23,8 @@ def expect_a_link_to_show_the_page_until_it_is_revoked(browser: Browser, page: P
     guest = watched_page(context, origin)
     seen = guest.page
     seen.goto(link)
-    expect(seen.get_by_role("heading", level=1)).to_contain_text("kitchen")
+    # The set's name is its owner's: strangers see the job's number.
+    expect(seen.get_by_role("heading", level=1)).to_contain_text(f"Job {job.removeprefix('job_')[:12]}")
     expect(seen.get_by_text("This page can be seen until")).to_be_visible()
     expect(seen.get_by_role("region", name="Verdict")).to_be_visible()
     with seen.expect_download() as coming:

@@ -51,6 +51,9 @@ def test_a_loop_that_stands_still_ends_the_process_and_says_where(tmp_path: Path
 def test_a_process_that_was_frozen_goes_on(tmp_path: Path):
     beat = tmp_path / "beats/of-it"
     process = start("works", beat)
+    until = time.monotonic() + 30
+    while not beat.exists() and time.monotonic() < until:
+        time.sleep(0.01)
     os.kill(process.pid, signal.SIGSTOP)
     frozen = beat.stat().st_mtime
     time.sleep(2.5)
