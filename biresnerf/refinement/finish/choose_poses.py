@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.refinement.adjustment.adjustment import NOTHING_FITS, Adjustment, adjust_poses, misfit
@@ -85,7 +86,7 @@ def choose_poses(
     rigs = [(Cameras.of(c.world_from_cam, c.lenses), split.fitted) for c in candidates]
     for kind, (misfit_to, as_well) in measured_misfits(rigs).items():
         misfits[kind], alike[kind] = misfit_to, as_well
-    choice = choose(candidates, misfits, alike, _kept_on_a_tie(candidates, set(misfits), alike))
+    choice = choose(candidates, misfits, alike, _kept_on_a_tie(candidates, set(misfits), alike, scene.start))
     announce()
     chosen, evidence = choice.chosen, dict.fromkeys(results, split.fitted)
     if chosen.name in BY_TRACKS:  # nothing has to be judged any more
@@ -127,10 +128,18 @@ def _believes_control(found: Adjustment, evidence: Evidence) -> bool:
 
 
 def _kept_on_a_tie(
-    candidates: Sequence[Candidate], kinds: set[str], alike: Mapping[str, NDArray[np.bool_]]
+    candidates: Sequence[Candidate],
+    kinds: set[str],
+    alike: Mapping[str, NDArray[np.bool_]],
+    start: InitialPoses,
 ) -> int:
-    """The input's poses; the refined ones where no kind of evidence tells these apart: the verdict will, by photos."""
+    """The input's poses; the refined ones where no kind of evidence tells these apart: the verdict will, by photos.
+
+    Where a trial by photos chose those of matches to start from, the input's have no such claim beside them.
+    """
     names = [candidate.name for candidate in candidates]
+    if "matched" in names and len(start.trials) > 1 and start.mostly_matched:
+        return names.index("matched")
     both = [names.index("input"), names.index("refined")] if "input" in names else [0, 0]
     told_apart = any(kind not in alike or not alike[kind][both].all() for kind in kinds)
     return both[0] if told_apart else both[1]
