@@ -86,7 +86,12 @@ def choose_poses(
     rigs = [(Cameras.of(c.world_from_cam, c.lenses), split.fitted) for c in candidates]
     for kind, (misfit_to, as_well) in measured_misfits(rigs).items():
         misfits[kind], alike[kind] = misfit_to, as_well
-    choice = choose(candidates, misfits, alike, _kept_on_a_tie(candidates, set(misfits), alike, scene.start))
+    choice = choose(candidates, misfits, alike, _kept_on_a_tie(candidates, set(misfits), alike))
+    if (
+        choice.chosen.name == "input"
+        and (matched := _that_won_the_trial(candidates, scene.start)) is not None
+    ):
+        choice = choose(candidates, misfits, alike, matched)
     announce()
     chosen, evidence = choice.chosen, dict.fromkeys(results, split.fitted)
     if chosen.name in BY_TRACKS:  # nothing has to be judged any more
@@ -131,18 +136,19 @@ def _kept_on_a_tie(
     candidates: Sequence[Candidate],
     kinds: set[str],
     alike: Mapping[str, NDArray[np.bool_]],
-    start: InitialPoses,
 ) -> int:
-    """The input's poses; the refined ones where no kind of evidence tells these apart: the verdict will, by photos.
-
-    Where a trial by photos chose those of matches to start from, the input's have no such claim beside them.
-    """
+    """The input's poses; the refined ones where no kind of evidence tells these apart: the verdict will, by photos."""
     names = [candidate.name for candidate in candidates]
-    if "matched" in names and len(start.trials) > 1 and start.mostly_matched:
-        return names.index("matched")
     both = [names.index("input"), names.index("refined")] if "input" in names else [0, 0]
     told_apart = any(kind not in alike or not alike[kind][both].all() for kind in kinds)
     return both[0] if told_apart else both[1]
+
+
+def _that_won_the_trial(candidates: Sequence[Candidate], start: InitialPoses) -> int | None:
+    """The poses of matches, where photos chose these to start from: no tie gives the input's back then."""
+    names = [candidate.name for candidate in candidates]
+    won = "matched" in names and len(start.trials) > 1 and start.mostly_matched
+    return names.index("matched") if won else None
 
 
 def _misfits(
