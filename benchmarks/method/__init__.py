@@ -1,1 +1,1 @@
-"""How well poses are found: seeding, the photometric loss and the verdict's trainings."""
+"""How well poses are found: seeding, lenses and the verdict's trainings."""

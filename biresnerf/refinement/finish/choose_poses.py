@@ -15,7 +15,7 @@ from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.refinement.adjustment.adjustment import NOTHING_FITS, Adjustment, adjust_poses, misfit
 from biresnerf.refinement.adjustment.cameras import Cameras
-from biresnerf.refinement.adjustment.choice import Candidate, choose
+from biresnerf.refinement.adjustment.choice import Candidate, Choice, choose
 from biresnerf.refinement.adjustment.evidence import Evidence, NoiseLevels, PosePrior
 from biresnerf.refinement.adjustment.measured_terms import control_believed, measured_misfits
 from biresnerf.refinement.adjustment.solver.covariance import NOTHING_KNOWN
@@ -86,12 +86,7 @@ def choose_poses(
     rigs = [(Cameras.of(c.world_from_cam, c.lenses), split.fitted) for c in candidates]
     for kind, (misfit_to, as_well) in measured_misfits(rigs).items():
         misfits[kind], alike[kind] = misfit_to, as_well
-    choice = choose(candidates, misfits, alike, _kept_on_a_tie(candidates, set(misfits), alike))
-    if (
-        choice.chosen.name == "input"
-        and (matched := _that_won_the_trial(candidates, scene.start)) is not None
-    ):
-        choice = choose(candidates, misfits, alike, matched)
+    choice = _choice(candidates, misfits, alike, scene.start)
     announce()
     chosen, evidence = choice.chosen, dict.fromkeys(results, split.fitted)
     if chosen.name in BY_TRACKS:  # nothing has to be judged any more
@@ -132,23 +127,29 @@ def _believes_control(found: Adjustment, evidence: Evidence) -> bool:
     return control_believed(evidence, Cameras.of(found.world_from_cam, lenses))
 
 
-def _kept_on_a_tie(
+def _choice(
     candidates: Sequence[Candidate],
-    kinds: set[str],
+    misfits: Mapping[str, Array],
     alike: Mapping[str, NDArray[np.bool_]],
+    start: InitialPoses,
+) -> Choice:
+    """As `choose`; but no tie gives the input's poses back where photos chose those of matches to start from."""
+    choice = choose(candidates, misfits, alike, _kept_on_a_tie(candidates, set(misfits), alike))
+    names = [candidate.name for candidate in candidates]
+    matches_won = "matched" in names and len(start.trials) > 1 and start.mostly_matched
+    if choice.chosen.name == "input" and matches_won:
+        return choose(candidates, misfits, alike, names.index("matched"))
+    return choice
+
+
+def _kept_on_a_tie(
+    candidates: Sequence[Candidate], kinds: set[str], alike: Mapping[str, NDArray[np.bool_]]
 ) -> int:
     """The input's poses; the refined ones where no kind of evidence tells these apart: the verdict will, by photos."""
     names = [candidate.name for candidate in candidates]
     both = [names.index("input"), names.index("refined")] if "input" in names else [0, 0]
     told_apart = any(kind not in alike or not alike[kind][both].all() for kind in kinds)
     return both[0] if told_apart else both[1]
-
-
-def _that_won_the_trial(candidates: Sequence[Candidate], start: InitialPoses) -> int | None:
-    """The poses of matches, where photos chose these to start from: no tie gives the input's back then."""
-    names = [candidate.name for candidate in candidates]
-    won = "matched" in names and len(start.trials) > 1 and start.mostly_matched
-    return names.index("matched") if won else None
 
 
 def _misfits(

@@ -7,7 +7,7 @@ import pytest
 
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.refinement.adjustment.choice import Candidate
-from biresnerf.refinement.finish.choose_poses import _kept_on_a_tie, _that_won_the_trial
+from biresnerf.refinement.finish.choose_poses import _choice, _kept_on_a_tie
 from biresnerf.report import TrialReport
 
 POSES = np.tile(np.eye(4), (4, 1, 1))
@@ -21,19 +21,25 @@ TRIALS = (
 CANDIDATES = [Candidate(name, POSES) for name in NAMES]
 
 
+# Misfits of input, refined, adjusted and matched poses to tracks of four cameras.
+TIE = np.array([[6.0, 6.0, 2.0, 2.0], [6.0, 6.0, 2.0, 2.0], [1.0, 1.5, 1.9, 2.1], [1.1, 1.4, 2.0, 2.0]])
+ADJUSTED_BEATS_INPUT = np.array([[8.0] * 4, [6.0, 2.0, 7.0, 3.0], [1.0, 1.1, 1.0, 1.1], [1.1, 1.0, 1.2, 1.1]])
+
+
 @pytest.mark.parametrize(
-    ("source", "trials", "name"),
+    ("source", "trials", "misfit", "name"),
     [
-        ("given", TRIALS, None),  # the trial was for them, or matches were no better
-        ("matches-incremental", (), None),  # photos alone: the input's poses are those of matches
-        ("matches-incremental", TRIALS, "matched"),
+        ("given", TRIALS, TIE, "input"),  # the trial was for them, or matches were no better
+        ("matches-incremental", (), TIE, "input"),  # photos alone: the input's poses are those of matches
+        ("matches-incremental", TRIALS, TIE, "matched"),
+        ("matches-incremental", TRIALS, ADJUSTED_BEATS_INPUT, "adjusted-tracks"),
+        ("given", TRIALS, ADJUSTED_BEATS_INPUT, "adjusted-tracks"),
     ],
-    ids=["given ones won", "photos alone", "matched ones won"],
+    ids=["given won", "photos alone", "matches won", "adjusted", "adjusted, given won"],
 )
-def test_poses_of_matches_that_won_the_trial_by_photos_take_the_inputs_place_on_a_tie(source, trials, name):
+def test_a_tie_gives_poses_that_lost_the_trial_by_photos_not_back(source, trials, misfit, name):
     start = InitialPoses(POSES, source, (source,) * 4, trials, POSES)
-    found = _that_won_the_trial(CANDIDATES, start)
-    assert (None if found is None else NAMES[found]) == name
+    assert _choice(CANDIDATES, {"tracks": misfit}, {}, start).chosen.name == name
 
 
 def test_refined_poses_are_kept_where_no_evidence_tells_them_from_the_inputs():
