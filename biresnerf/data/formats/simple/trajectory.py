@@ -1,4 +1,4 @@
-"""Trajectories of SLAM tools: TUM (time, position, quaternion) and KITTI (12 numbers), with a camera beside them."""
+"""Trajectories of SLAM tools: TUM (position, quaternion, mostly a time), KITTI (12 numbers), a camera beside them."""
 
 from __future__ import annotations
 
@@ -39,6 +39,7 @@ TRAJECTORY = Format(
         "tum.txt",
         "kitti.txt",
         "poses.txt",
+        "pose.txt",
         "groundtruth.txt",
         "CameraTrajectory.txt",
         "KeyFrameTrajectory.txt",
@@ -175,12 +176,14 @@ def matched(trajectory: Trajectory, names: Sequence[str], root: Path) -> tuple[d
 
 
 def _is_trajectory(file: Path) -> bool:
-    """Whether it is called as trajectories are, or a number alone (KITTI's sequences) and begins as one of KITTI's."""
-    if not file.is_file() or not file.stem.isdecimal():
+    """Whether it is called as trajectories are; of names that say less, whether the first line is one's."""
+    sequence = file.stem.isdecimal()  # KITTI's are called by numbers
+    if not file.is_file() or not (sequence or file.stem == "pose"):
         return file.is_file()
     with file.open("rb") as opened:
         words = opened.readline(4096).split()
-    return len(words) == 12 and all(number_of(word.decode("latin-1")) is not None for word in words)
+    lengths = (12,) if sequence else (7, 8, 12)
+    return len(words) in lengths and all(number_of(word.decode("latin-1")) is not None for word in words)
 
 
 def write_tum(refined: RefinedSet, path: Path) -> None:

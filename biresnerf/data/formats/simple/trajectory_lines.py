@@ -21,8 +21,8 @@ from biresnerf.errors import InputError
 
 IMAGES_OF = "{stem}_images.txt"  # beside our KITTI files, which have no room for names: an image a line
 MAX_POSES = 100_000
-_HINT = "Give lines of `time x y z qx qy qz qw` (TUM), or of 12 numbers, [R | t] by rows (KITTI)."
-_COLUMNS: dict[int, str] = {8: "tum", 12: "kitti"}
+_HINT = "Give lines of `time x y z qx qy qz qw` (TUM; without times, as many as images), or [R | t] by rows (KITTI)."
+_COLUMNS: dict[int, str] = {7: "tum", 8: "tum", 12: "kitti"}
 # What `refine` writes above its poses: which image was taken when.
 _NAMED_TIME = re.compile(r"#\s*([-+0-9.eE]+)\s+(\S.*\S|\S)\s*$")
 
@@ -73,7 +73,7 @@ class Trajectory:
             raise _invalid(file.name, "two poses have the same time.")
 
     def _add(self, number: int, words: list[str], columns: int) -> None:
-        """The pose of a line; a bad line of TUM's is left out, one of KITTI's keeps its place among the others."""
+        """The pose of a line; a bad line with a time is left out, one without keeps its place among the others."""
         where = f"{self.file.name} line {number}"
         found = attempt(partial(_pose_of, words, columns, where))
         if not isinstance(found, InputError):
@@ -83,7 +83,7 @@ class Trajectory:
             self.lines.append(number)
             return
         self.left_out.append(PoseEntry(f"line {number}", None, where, problem=found))
-        if columns == 12:
+        if columns != 8:
             self.problems[len(self.poses)] = self.left_out.pop()
             self.poses.append(np.eye(4))
             self.lines.append(number)
@@ -104,11 +104,11 @@ class Trajectory:
 def _pose_of(words: list[str], columns: int, where: str) -> tuple[float | None, NDArray[np.float64]]:
     """The time, where the form has it, and the pose of a line."""
     if len(words) not in _COLUMNS or len(words) != columns:
-        raise _invalid(where, f"has {len(words)} numbers, not 8 (TUM) or 12 (KITTI) as every line.")
+        raise _invalid(where, f"has {len(words)} numbers, not 8 or 7 (TUM) or 12 (KITTI) as every line.")
     values = finite_numbers(words, where, _HINT)
-    if columns == 8:
-        time, *centre, x, y, z, w = values.tolist()
-        return time, matrix_of_pose(rigid_pose([w, x, y, z, *centre], where, _HINT))
+    if columns < 12:
+        *time, a, b, c, x, y, z, w = values.tolist()
+        return (time[0] if time else None), matrix_of_pose(rigid_pose([w, x, y, z, a, b, c], where, _HINT))
     return None, rigid_matrix(values.reshape(3, 4).tolist(), where)[0]
 
 

@@ -193,6 +193,23 @@ def test_a_trajectory_without_camera_gets_a_guess_and_says_so(tmp_path):
     assert not any("is a guess" in text for text in dataset.warnings)
 
 
+def test_positions_and_quaternions_without_times_are_read_in_order(tmp_path):
+    file = trajectories.tum_set(tmp_path, ["0", "1", "2", "3"])
+    file.unlink()
+    lines = [line.partition(" ")[2] for line in trajectories.tum_lines(["0", "1", "2", "3"])]
+    (tmp_path / "pose.txt").write_text("\n".join(lines))
+    dataset = read_dataset(tmp_path)
+    assert_at_truth(dataset)
+    assert "in the order of the images' names" in dataset.warnings[0]
+    assert [frame.timestamp_s for frame in dataset.frames] == [None] * 4
+
+
+def test_a_file_called_pose_that_holds_none_is_no_trajectory(tmp_path):
+    trajectories.write_images(tmp_path)
+    (tmp_path / "pose.txt").write_text("look to the left\n")
+    assert not read_dataset(tmp_path).posed.any()
+
+
 def test_kitti_poses_are_read_in_order_with_the_projection_of_their_camera(tmp_path):
     trajectories.kitti_set(tmp_path)
     dataset = read_dataset(tmp_path)
