@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 from biresnerf.commands.poses.refine import refine_command
 from biresnerf.errors import InputError
-from biresnerf.options.option import Option
+from biresnerf.options.option import Option, divided, lowered
 from biresnerf.options.presets import METHOD_VALUES, PRESETS
 from biresnerf.options.refine_options import (
     OPTIONS,
@@ -149,3 +149,8 @@ def test_the_first_screen_of_help_names_no_option_for_research():
     screen = CliRunner().invoke(refine_command, ["--help"]).output
     assert "--preset" in screen
     assert not [name for name, option in OPTIONS.items() if option.level == "research" and name in screen]
+
+
+def test_less_memory_never_means_more_of_anything():
+    assert [divided(2, 64)(value) for value in (400, 100, 64, 32)] == [200, 64, 64, 32]
+    assert [lowered(2, 10)(value) for value in (19, 11, 10, 8)] == [17, 10, 10, 8]

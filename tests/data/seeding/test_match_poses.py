@@ -159,6 +159,17 @@ def test_a_camera_whose_given_position_alone_is_far_off_is_believed_within_reaso
         assert np.flatnonzero(~carried.placed).tolist() == ([] if believed else [3])
 
 
+@pytest.mark.parametrize("scale", [0.001, 1000.0])
+def test_which_cameras_stray_does_not_depend_on_the_unit_of_the_given_poses(noisy, truth, scale):
+    given = noisy.world_from_cam
+    given[3, :3, 3] += 0.5 * (given[3, :3, 3] - given[6, :3, 3])
+    larger = Similarity(scale, np.eye(3), np.zeros(3)).apply_to_poses(given)
+    as_given, in_other_units = (
+        carry_model(model(truth), poses, noisy.posed).placed for poses in (given, larger)
+    )
+    assert as_given.tolist() == in_other_units.tolist()
+
+
 def test_a_model_with_many_strays_is_not_offered(noisy, truth):
     assert carry_model(model(truth, turned=(1, 4, 8)), noisy.world_from_cam, noisy.posed) is None
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
-from biresnerf.geometry.earth.georeference import NoGeoreference, fit_positions
+from biresnerf.geometry.earth.georeference import BELIEVED, NoGeoreference, fit_positions
 from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.geometry.similarity import Similarity
 
@@ -75,6 +76,16 @@ def test_an_accuracy_that_the_residuals_contradict_is_doubted_and_the_frame_is_k
     assert "accuracy of 0.05 m is not believed" in doubted.doubt
     assert doubted.metres_from_world.scale * WORLD_FROM_METRES.scale == pytest.approx(1, abs=0.05)
     assert not fit_positions(world, positions, np.full((COUNT, 3), 1.5)).doubt
+
+
+def test_an_accuracy_is_doubted_just_where_normal_errors_would_hardly_reach_the_residuals():
+    poses = cameras_m()
+    positions, world = measured(poses, 2.0), WORLD_FROM_METRES.apply_to_poses(poses)
+    apart = fit_positions(world, positions).residual_m
+    # Of normal errors in three coordinates the median length is 1.538 deviations, the root of chi-square's median.
+    bound = np.median(apart) / (BELIEVED * np.sqrt(chi2(3).median()))
+    assert fit_positions(world, positions, np.full((COUNT, 3), 0.97 * bound)).doubt
+    assert not fit_positions(world, positions, np.full((COUNT, 3), 1.03 * bound)).doubt
 
 
 def test_a_gimbals_angles_tell_the_turn_about_a_line_unless_they_contradict_the_cameras():

@@ -130,6 +130,15 @@ def test_a_run_without_a_budget_takes_all_its_steps(scene, tmp_path):
     assert budget_warnings(stages) == ()
 
 
+def test_time_before_an_interruption_counts_against_the_budget(scene, tmp_path):
+    stages = stages_of(scene, tmp_path, time_budget_s=200.0)
+    keep_to_budget(stages, 1000.0, STEPS)
+    whole = stages.ends
+    stages.record.seconds.update(preparing=20.0, coarse=30.0)
+    keep_to_budget(stages, 1000.0, STEPS)
+    assert stages.ends == pytest.approx(whole - 50.0)
+
+
 @pytest.mark.slow
 def test_a_resumed_run_keeps_the_lengths_that_were_chosen(scene, tmp_path):
     stages = stages_of(scene, tmp_path, time_budget_s=0.01)

@@ -79,6 +79,17 @@ def test_too_few_matches_or_wrong_ones_or_no_trusted_cameras_place_nothing():
     assert not contradicted(own.errors_px(together)).any()
 
 
+def test_observations_that_were_left_out_place_no_camera():
+    poses, own = rig(11)
+    lost, trusted = without(poses, 4, 11), np.arange(12) != 4
+    tracks = own.tracks
+    judging = tracks.left_out()[tracks.point] & (tracks.image == 4)
+    assert judging.sum() > 5
+    moved = tracks.xy + 40.0 * judging[:, None]
+    changed = OwnMatches(Tracks.of(tracks.point, tracks.image, moved), [CAMERA] * 12)
+    np.testing.assert_array_equal(changed.placed(4, lost, trusted), own.placed(4, lost, trusted))
+
+
 def test_each_cameras_error_is_the_median_over_its_own_pairs():
     poses, own = rig(10, cameras=9, points=31, wrong=0.3)
     one, other = own.tracks.pairs()

@@ -7,7 +7,7 @@ import pytest
 
 from biresnerf.options.presets import PRESETS
 from biresnerf.options.refine_options import RefineOptions
-from biresnerf.refinement.optimise.schedule import FREEZE_SHARE, Schedule, smooth_ramp
+from biresnerf.refinement.optimise.schedule import FREEZE_SHARE, LENS_START, Schedule, smooth_ramp
 
 pytestmark = pytest.mark.slow
 
@@ -45,6 +45,13 @@ def test_the_smooth_ramp_is_flat_at_both_ends_and_half_in_the_middle():
     assert smooth_ramp(0.25) == pytest.approx(0.5 * (1 - np.sqrt(0.5)))
     assert smooth_ramp(1e-3) < 1e-5
     assert smooth_ramp(1 - 1e-3) > 1 - 1e-5
+
+
+def test_lenses_stand_still_until_poses_have_explained_what_they_can(schedule):
+    start = LENS_START * schedule.options.coarse_steps_min
+    assert start > 1
+    assert all(schedule.lens_rate(step, None) == 0.0 for step in range(int(start) + 1))
+    assert schedule.lens_rate(int(1.5 * start), None) > 0.0
 
 
 def test_everything_within_stage_1_changes_little_from_step_to_step(schedule):

@@ -58,6 +58,15 @@ def test_a_run_taken_with_the_camera_on_its_side_is_turned_back():
     assert ring.quarters.tolist() == [0] * 12 + [1] * 24
 
 
+def test_quarter_turns_add_up_from_run_to_run():
+    taken = [np.rot90(photo, -(index // 12)) for index, photo in enumerate(around())]
+    ring = find_ring(photos_set([np.ascontiguousarray(photo) for photo in taken]), np.arange(COUNT))
+    first = ring.quarters[ring.order[0]]
+    assert [(int(q) - first) % 4 for q in ring.quarters] == [
+        (i // 12 - ring.order[0] // 12) % 4 for i in range(COUNT)
+    ]
+
+
 def test_the_axis_is_where_the_mean_photo_is_symmetric_also_in_photos_on_their_side():
     right = FOCAL * np.tan(0.08) / SIZE
     for photos, expected in ((around(), (0, 0.0)), (around(0.08), (0, right))):
