@@ -15,12 +15,13 @@ from biresnerf.data.seeding import cached_mapping as remembered_mapping
 from biresnerf.data.seeding import map_images
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.data.seeding.map_images import MappedModel
-from biresnerf.data.seeding.match_poses import carry_model
+from biresnerf.data.seeding.match_poses import STRAY_SHARE, carry_model
 from biresnerf.data.seeding.seed_poses import Seeding, seed_poses
 from biresnerf.data.synthetic.camera_photos import MAKERS
 from biresnerf.data.synthetic.scene import synthetic_focal
 from biresnerf.errors import FAULTS_RAISE, Interrupted, RefinementError
 from biresnerf.geometry.camera.camera_models import Camera
+from biresnerf.geometry.focus import focus_point
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import rotation_angle_deg, rotation_between_deg
 from biresnerf.geometry.similarity import Similarity, align_by_spread
@@ -159,15 +160,16 @@ def test_a_camera_whose_given_position_alone_is_far_off_is_believed_within_reaso
         assert np.flatnonzero(~carried.placed).tolist() == ([] if believed else [3])
 
 
-@pytest.mark.parametrize("scale", [0.001, 1000.0])
-def test_which_cameras_stray_does_not_depend_on_the_unit_of_the_given_poses(noisy, truth, scale):
-    given = noisy.world_from_cam
-    given[3, :3, 3] += 0.5 * (given[3, :3, 3] - given[6, :3, 3])
-    larger = Similarity(scale, np.eye(3), np.zeros(3)).apply_to_poses(given)
-    as_given, in_other_units = (
-        carry_model(model(truth), poses, noisy.posed).placed for poses in (given, larger)
-    )
-    assert as_given.tolist() == in_other_units.tolist()
+@pytest.mark.parametrize("unit", [0.001, 1.0, 1000.0])
+def test_which_cameras_stray_does_not_depend_on_the_unit_of_the_given_poses(truth, unit):
+    given = truth.world_from_cam
+    distance = focus_point(given).mean_distance
+    given[3, 1, 3] += 0.6 * STRAY_SHARE * distance
+    given[6, 1, 3] += 3 * STRAY_SHARE * distance
+    in_unit = Similarity(unit, np.eye(3), np.zeros(3)).apply_to_poses(given)
+    carried = carry_model(model(truth), in_unit, truth.posed)
+    assert carried is not None
+    assert np.flatnonzero(~carried.placed).tolist() == [6]
 
 
 def test_a_model_with_many_strays_is_not_offered(noisy, truth):
