@@ -179,5 +179,7 @@ async def test_a_silent_worker_is_tidied_away_in_the_end(settings: Settings, slo
         )
         (silent,) = await registered(database)
         slots.start(settings, "a")
-        while silent in await registered(database):
-            await asyncio.sleep(0.05)
+        async with asyncio.timeout(120):
+            while silent in await registered(database):
+                await asyncio.sleep(0.05)
+        assert await registered(database), "the live one stays"
