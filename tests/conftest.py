@@ -91,9 +91,11 @@ def _skips(config: pytest.Config) -> tuple[int, Counter[str]]:
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    strict = session.config.getoption("unexpected_skips_fail")
-    if strict and _skips(session.config)[1] and session.exitstatus == pytest.ExitCode.OK:
-        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+    unexpected = _skips(session.config)[1] if session.config.getoption("unexpected_skips_fail") else None
+    if unexpected:
+        session.config.cache.set("biresnerf/unexpected_skips", unexpected)  # which running failed tests again forgets
+        if session.exitstatus == pytest.ExitCode.OK:
+            session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
 def _write_time_by_file(terminalreporter: pytest.TerminalReporter) -> None:
