@@ -93,7 +93,8 @@ def _skips(config: pytest.Config) -> tuple[int, Counter[str]]:
 def pytest_sessionfinish(session: pytest.Session) -> None:
     unexpected = _skips(session.config)[1] if session.config.getoption("unexpected_skips_fail") else None
     if unexpected:
-        session.config.cache.set("biresnerf/unexpected_skips", unexpected)  # which running failed tests again forgets
+        # Kept for CI, as running failed tests again forgets them.
+        session.config.cache.set("biresnerf/unexpected_skips", unexpected)
         if session.exitstatus == pytest.ExitCode.OK:
             session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
