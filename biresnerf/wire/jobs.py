@@ -50,6 +50,22 @@ class JobProgress(Record):
     eta_s: float | None = Field(None, examples=[71.5])
 
 
+class JobUse(Record):
+    """What the attempts of a job used that are over, however they ended."""
+
+    processor_s: float = Field(
+        0.0,
+        examples=[412.5],
+        description="User and system seconds of their processes. Of a lost worker: until its last sign.",
+    )
+    wall_s: float = Field(
+        0.0, examples=[230.1], description="How long they took, from the claim to the stored result."
+    )
+    gpu_s: float = Field(
+        0.0, examples=[0.0], description="How long they took on slots with a GPU; exports need none."
+    )
+
+
 class JobLinks(Links):
     """Paths of the parts of a job."""
 
@@ -69,6 +85,11 @@ class JobView(Record):
 
     id: str = Field(examples=["job_01JD8Y3V1QKZ5M0C7W2N4T6XAB"])
     tenant: str = Field("local", description="The owner.")
+    key_id: str | None = Field(
+        None,
+        examples=["key_01JD8Y3V1QKZ5M0C7W2N4T6XAB"],
+        description="The API key that submitted it; null without one.",
+    )
     kind: JobKind = Field("refine", description="`export` writes the result of `parent` in further forms.")
     parent: str | None = Field(None, description="The job whose result an export writes.")
     forked_from: str | None = Field(None, description="The job that this one was forked from.")
@@ -83,6 +104,7 @@ class JobView(Record):
     state: JobState = Field(examples=["running"])
     stage: Stage | None = Field(None, examples=["coarse"])
     progress: JobProgress = JobProgress()
+    use: JobUse = JobUse()
     priority: PriorityName = "normal"
     queue_position: int | None = Field(None, description="1 is next; null unless queued.")
     attempt: int = Field(0, examples=[1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import date
 from typing import Any, Literal
 
 from pydantic import Field
@@ -27,9 +28,35 @@ class TenantShare(Record):
     max_stored_bytes: int = Field(
         examples=[107_374_182_400], description="Bytes of datasets, uploads and results together."
     )
+    max_daily_seconds: int = Field(
+        examples=[0], description="Seconds that its jobs may run in a day (UTC), added up."
+    )
     running: int = Field(examples=[1])
     queued: int = Field(examples=[2])
     stored_bytes: int = Field(examples=[1_288_490_188])
+    seconds_today: float = Field(examples=[840.2])
+
+
+UsageKey = Literal["day", "tenant", "key", "device"]
+
+
+class UsageRow(Record):
+    """What attempts used that ended in a time. What the rows are not split by is null."""
+
+    day: date | None = Field(None, description="In UTC.")
+    tenant: str | None = Field(None, examples=["anna"])
+    key_id: str | None = Field(None, description="The API key that submitted the jobs; empty without one.")
+    device: Literal["cpu", "gpu"] | None = Field(None, examples=["gpu"])
+    attempts: int = Field(examples=[12])
+    processor_s: float = Field(examples=[4100.5], description="User and system seconds of their processes.")
+    wall_s: float = Field(examples=[2300.1])
+    gpu_s: float = Field(examples=[2300.1], description="Of `wall_s`, on slots with a GPU.")
+
+
+class UsageList(Record):
+    """Use in a time."""
+
+    items: tuple[UsageRow, ...]
 
 
 class OptionsView(Record):

@@ -20,7 +20,8 @@ _LIMIT = click.IntRange(min=-1)
 def tenants_command() -> None:
     """List tenants and set their shares and limits.
 
-    A limit of 0 means no limit; -1 means the default in BIRESNERF_TENANT_MAX_RUNNING, …_QUEUED or …_STORED_BYTES.
+    A limit of 0 means no limit; -1 means the default in BIRESNERF_TENANT_MAX_RUNNING, …_QUEUED, …_STORED_BYTES or
+    …_DAILY_SECONDS.
     """
 
 
@@ -46,6 +47,7 @@ def list_command(as_json: bool, data_dir: Path | None) -> None:
 @click.option("--max-running", type=_LIMIT, help="Jobs running at the same time.")
 @click.option("--max-queued", type=_LIMIT, help="Jobs waiting.")
 @click.option("--max-stored-bytes", type=_LIMIT, help="Bytes of datasets, uploads and results.")
+@click.option("--max-daily-seconds", type=_LIMIT, help="Seconds that its jobs may run in a day (UTC).")
 @json_option
 @data_dir_option
 def set_command(name: str, as_json: bool, data_dir: Path | None, **changes: Any) -> None:
@@ -67,5 +69,6 @@ def _line(share: TenantShare) -> str:
         f"running {used(share.running, share.max_running)}",
         f"queued {used(share.queued, share.max_queued)}",
         f"bytes {used(share.stored_bytes, share.max_stored_bytes)}",
+        f"seconds today {used(round(share.seconds_today), share.max_daily_seconds)}",
     )
     return "  ".join(parts)

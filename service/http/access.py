@@ -279,7 +279,7 @@ async def _caller(
     tenant, stores = identity.tenant, service.stores
     caller = Caller(
         *(service, tenant, identity.scopes, request.state.client, identity.link),
-        jobs=stores.jobs.for_tenant(tenant),
+        jobs=stores.jobs.for_tenant(tenant, identity.key_id),
         datasets=stores.datasets.for_tenant(tenant),
         uploads=stores.uploads.for_tenant(tenant),
         webhooks=stores.webhooks.for_tenant(tenant),

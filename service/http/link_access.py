@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import Any
 
 from biresnerf.wire.jobs import JobView
 from service.http.problems import ProblemError
@@ -20,7 +21,7 @@ def require_shown(job_id: str, method: str, path: str) -> None:
 
 
 def shown_to_strangers(job: JobView) -> JobView:
-    """The job without its tenant, labels, dataset, and the jobs that it was made from."""
+    """The job without its tenant, key, labels, dataset, and the jobs that it was made from."""
     links = job.links.model_copy(update={"dataset": ""})
-    owners = {"tenant": "", "labels": {}, "dataset_id": "", "links": links}
+    owners: dict[str, Any] = {"tenant": "", "key_id": None, "labels": {}, "dataset_id": "", "links": links}
     return job.model_copy(update={**owners, "parent": None, "forked_from": None, "fixed_from": None})

@@ -41,6 +41,13 @@ _COUNTERS = {
         "Faults of ours that jobs went on without: evidence was missing.",
     ),
     "job_requeues": ("biresnerf_job_requeues", "why", "Jobs given back; why=worker_lost is a take-over."),
+    "processor_seconds": (
+        "biresnerf_use_processor_seconds",
+        "tenant",
+        "Processor seconds of attempts that ended.",
+    ),
+    "wall_seconds": ("biresnerf_use_wall_seconds", "tenant", "How long attempts took that ended."),
+    "gpu_seconds": ("biresnerf_use_gpu_seconds", "tenant", "How long attempts had a GPU that ended."),
     "webhook_attempts": ("biresnerf_webhook_attempts", "result", "Deliveries of webhook messages tried."),
     "stored_files": ("biresnerf_stored_files", "", "Files stored in datasets."),
     "stored_bytes": ("biresnerf_stored_bytes", "", "Bytes of the files stored in datasets."),

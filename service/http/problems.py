@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import random
+import time
 from http import HTTPStatus
 from typing import Any
 
@@ -73,6 +74,7 @@ CATALOGUE: dict[str, tuple[int, str]] = {
     "headers_too_large": (431, "The request headers are too large"),
     "queue_full": (429, "Too many jobs are waiting"),
     "quota_exhausted": (429, "The tenant's quota is exhausted"),
+    "daily_limit_reached": (429, "The tenant's jobs have run long enough today"),
     "rate_limited": (429, "Too many requests in a short time"),
     "too_many_uploads": (429, "Too many uploads at the same time"),
     "client_gone": (499, "The client went away"),
@@ -112,6 +114,8 @@ class ProblemError(FaultError):
     def response_headers(self) -> dict[str, str]:
         """Extra headers of the response; a retryable one says when to retry."""
         wait_s = _LONGER_S.get(self.code) or str(random.randint(*RETRY_AFTER_S))
+        if self.code == "daily_limit_reached":  # days of UTC begin at multiples of 86400 s
+            wait_s = str(86400 - int(time.time()) % 86400)
         return {**({"Retry-After": wait_s} if self.retryable else {}), **self.headers}
 
     def problem(self, instance: str | None = None, request_id: str | None = None) -> Problem:

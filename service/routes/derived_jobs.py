@@ -108,6 +108,7 @@ def _row(image: dict[str, Any]) -> ImageRow:
     responses=declared(
         *("fork_not_possible", "dataset_not_ready", "invalid_options", "queue_full", "quota_exhausted"),
         *("bad_idempotency_key", "idempotency_key_reused", "storage_unavailable", "storage_full"),
+        "daily_limit_reached",
     ),
 )
 async def fork_job(
@@ -126,7 +127,10 @@ async def fork_job(
     status_code=202,
     response_model=JobView,
     tags=["results"],
-    responses=declared("result_not_ready", "state_conflict", "queue_full", "quota_exhausted", "storage_full")
+    responses=declared(
+        *("result_not_ready", "state_conflict", "queue_full", "quota_exhausted", "daily_limit_reached"),
+        "storage_full",
+    )
     | {200: {"model": JobView, "description": "The same export was requested before and is complete."}},
 )
 async def export_job(job_id: JobId, caller: JobWriter, body: NewExport) -> Response:

@@ -57,7 +57,7 @@ _DISCARD = CancelJob()
     responses=declared(
         *("bad_idempotency_key", "not_found", "dataset_not_ready", "invalid_options"),
         *("idempotency_key_reused", "archive_rejected", "queue_full", "storage_full", "too_many_uploads"),
-        *("webhook_url_refused", "priority_not_allowed", "quota_exhausted"),
+        *("webhook_url_refused", "priority_not_allowed", "quota_exhausted", "daily_limit_reached"),
         *("result_not_ready", "state_conflict", "expired"),
     )
     | {200: {"model": JobView, "description": "The job has ended; only with `Prefer: wait`."}},

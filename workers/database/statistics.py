@@ -108,6 +108,16 @@ async def fold_tallies(connection: Connection) -> None:
     )
 
 
+async def fold_use(connection: Connection) -> None:
+    """Adds the records of single attempts up."""
+    await connection.execute(
+        "WITH taken AS (DELETE FROM use_records WHERE (day, tenant, key_id, device) IN ("
+        " SELECT day, tenant, key_id, device FROM use_records GROUP BY 1, 2, 3, 4 HAVING count(*) > 1) RETURNING *)"
+        " INSERT INTO use_records SELECT day, tenant, key_id, device, sum(attempts), sum(processor_s), sum(wall_s)"
+        " FROM taken GROUP BY 1, 2, 3, 4"
+    )
+
+
 async def announce_slot(database: Database, host: str, name: str, worker_id: int) -> None:
     """Writes down which worker of the queue a slot is; forgets those that are gone."""
     async with database.transaction() as connection:

@@ -73,6 +73,8 @@ async def _claim(
             return None
         if not await job_queue.lock_taken(connection, row["queue_id"], worker_id):
             return None
+        if row["state"] == "running":  # the end of its last attempt was never written
+            await connection.execute("UPDATE jobs SET run_token = NULL WHERE id = %s", (job_id,))
         if row["cancel_requested"]:
             await finish_cancelled(connection, job_id, stall_s)
             return None

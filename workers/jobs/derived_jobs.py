@@ -33,7 +33,7 @@ class DerivedJobs(JobStore):
 
     def __init__(self, jobs: JobStore, files: FileStore) -> None:
         super().__init__(jobs._database, jobs._listener, jobs._settings)
-        self._files, self._tenant = files, jobs._tenant
+        self._files, self._tenant, self._key_id = files, jobs._tenant, jobs._key_id
 
     async def fork(
         self,
@@ -155,6 +155,7 @@ class DerivedJobs(JobStore):
         self, connection: Connection, parent: Mapping[str, Any], job_id: str, values: Mapping[str, Any]
     ) -> JobView:
         """A queued job on the dataset of ``parent``, for its tenant."""
-        row = {"id": job_id, "dataset_id": parent["dataset_id"], "tenant": parent["tenant"], **values}
+        own = {"id": job_id, "key_id": self._key_id}
+        row = {**own, "dataset_id": parent["dataset_id"], "tenant": parent["tenant"], **values}
         await queue_job(connection, await insert_job(connection, row))
         return job_from_row(await self._required(connection, job_id))

@@ -10,7 +10,7 @@ from typing import Any
 from psycopg.types.json import Jsonb
 
 from biresnerf.options.refine_options import RefineOptions
-from biresnerf.wire.jobs import JobEvent, JobProgress, JobView, PriorityName
+from biresnerf.wire.jobs import JobEvent, JobProgress, JobUse, JobView, PriorityName
 from workers.database.database import Connection
 from workers.records import PREVIEW_FOLDER, THUMBNAIL_NAME, priority_name, record_from_row
 from workers.settings.errors import Conflict, Expired
@@ -35,6 +35,7 @@ def job_from_row(row: dict[str, Any]) -> JobView:
         JobView,
         row,
         progress=record_from_row(JobProgress, row),
+        use=record_from_row(JobUse, row),
         priority=priority_name(row["priority"]),
         thumbnail=_thumbnail(row),
     )

@@ -64,6 +64,7 @@ async def start_attempt(connection: Connection, job_id: str, token: uuid.UUID) -
         "UPDATE jobs SET state = 'running', attempt = attempt + 1, run_token = %s, fraction = 0,"
         " slot_kind = (SELECT slots.kind FROM queue_entries AS entry JOIN slots USING (worker_id)"
         " WHERE entry.id = jobs.queue_id),"
+        " attempt_started_at = clock_timestamp(), attempt_seen_at = clock_timestamp(), attempt_processor_s = 0,"
         " step = 0, steps_total = 0, stage = NULL, eta_s = NULL, message = '',"
         " started_at = coalesce(started_at, clock_timestamp()) WHERE id = %s RETURNING *",
         token,

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 from collections.abc import AsyncGenerator, Mapping
 from datetime import datetime
-from typing import Any
+from typing import Any, Self
 
 from psycopg.types.json import Jsonb
 
@@ -55,6 +55,13 @@ class JobStore(OwnedStore):
     def __init__(self, database: Database, listener: JobListener, settings: Settings) -> None:
         super().__init__(database)
         self._listener, self._settings = listener, settings
+        self._key_id: str | None = None
+
+    def for_tenant(self, tenant: str | None, key_id: str | None = None) -> Self:
+        """The store limited to the tenant; new jobs are noted as submitted with this key."""
+        bound = super().for_tenant(tenant)
+        bound._key_id = key_id
+        return bound
 
     @traced("submit")
     async def submit(
@@ -76,8 +83,8 @@ class JobStore(OwnedStore):
         Returns the job and whether it is new (False: the same key with the same request came before).
         ``fixed_from`` is a job whose poses and lenses stay, of photos that both have.
         Raises `NotFound` (dataset, job), `Conflict` (``dataset_not_ready``, ``idempotency_key_reused``,
-        ``priority_not_allowed``, a code of `require_result`), `LimitReached` (``queue_full``, ``quota_exhausted``),
-        `InputError` (``webhook_url_refused``).
+        ``priority_not_allowed``, a code of `require_result`), `LimitReached` (``queue_full``, ``quota_exhausted``,
+        ``daily_limit_reached``), `InputError` (``webhook_url_refused``).
         """
         asked = asked_columns(options)
         subject = request_with(request_digest or dataset_id, webhook)
@@ -97,6 +104,7 @@ class JobStore(OwnedStore):
                 "id": job_id,
                 "dataset_id": dataset_id,
                 "tenant": tenant,
+                "key_id": self._key_id,
                 "priority": PRIORITIES[priority],
                 "fixed_from": fixed_from,
                 **asked,

@@ -103,6 +103,15 @@ class Ledger:
             await connection.execute("SELECT pg_notify('biresnerf_jobs', %s)", (job["id"],))
 
     @_fenced(_nothing)
+    async def note_use(self, connection: Connection, job: DictRow, processor_s: float) -> None:
+        """The attempt runs, and has used so many processor seconds: what counts if its end is never written."""
+        await connection.execute(
+            "UPDATE jobs SET attempt_seen_at = clock_timestamp(),"
+            " attempt_processor_s = greatest(attempt_processor_s, %s) WHERE id = %s",
+            (processor_s, job["id"]),
+        )
+
+    @_fenced(_nothing)
     async def checkpoint(
         self, connection: Connection, job: DictRow, prefix: str, files: Sequence[str], step: int
     ) -> None:

@@ -25,7 +25,7 @@ async def require_room(connection: Connection, dataset_id: str, priority: int, m
     """What must hold for one more job on the dataset.
 
     Raises `NotFound`, `Conflict` (``dataset_not_ready``, ``priority_not_allowed``), `LimitReached`
-    (``queue_full``: ``max_queued`` jobs wait already; ``quota_exhausted``).
+    (``queue_full``: ``max_queued`` jobs wait already; ``quota_exhausted``; ``daily_limit_reached``).
     """
     sql = "SELECT state, tenant FROM datasets WHERE id = %s FOR SHARE"
     dataset = await connection.required_row(f"No dataset {dataset_id}.", sql, dataset_id)
@@ -47,6 +47,22 @@ async def _require_job_quota(connection: Connection, tenant: str, priority: int)
         if queued >= limits["max_queued"]:
             raise LimitReached("quota_exhausted", f"{queued} of your jobs wait already, which is the limit.")
     await _require_bytes(connection, tenant, limits["max_stored_bytes"], 1)
+    if limits["max_daily_seconds"]:
+        await _require_seconds(connection, tenant, limits["max_daily_seconds"])
+
+
+async def _require_seconds(connection: Connection, tenant: str, limit: int) -> None:
+    now = await connection.only_row(
+        "SELECT seconds_today(%s) AS used, rfc3339(date_trunc('day', clock_timestamp(), 'UTC') + interval '1 day')"
+        " AS reset_at",
+        tenant,
+    )
+    if now["used"] >= limit:
+        raise LimitReached(
+            "daily_limit_reached",
+            f"Your jobs have run for {now['used']:.0f} s today, and the limit max_daily_seconds is {limit}."
+            f" It starts again at {now['reset_at']}.",
+        )
 
 
 async def require_byte_quota(connection: Connection, dataset_id: str, size: int) -> None:
@@ -62,7 +78,7 @@ async def require_byte_quota(connection: Connection, dataset_id: str, size: int)
 
 async def _limits(connection: Connection, tenant: str) -> dict[str, int]:
     await _lock_tenant(connection, tenant)
-    sql = "SELECT top_priority, max_queued, max_stored_bytes FROM tenant_limits WHERE id = %s"
+    sql = "SELECT top_priority, max_queued, max_stored_bytes, max_daily_seconds FROM tenant_limits WHERE id = %s"
     return await connection.only_row(sql, tenant)
 
 

@@ -78,6 +78,7 @@ class Attempt:
         self._folder, self._output, self._log = folder, folder / "output", folder / LOG_NAME
         self._stop_reason: StopReason | None = None
         self._stop = asyncio.Event()
+        self._child: Child | None = None
         self._timed_out = False
         self._resolved: ResolvedOptions | None = None
         self._oom_kills = OomKills()
@@ -94,6 +95,7 @@ class Attempt:
 
         What goes wrong on our side counts as a crash of the attempt, unless disk or store are to blame.
         """
+        noting = asyncio.create_task(self._note_use_again())
         try:
             return await self._run()
         except Fenced:
@@ -101,11 +103,24 @@ class Attempt:
             await self._files.delete_prefix(self._result_prefix)
             raise
         finally:
+            noting.cancel()
             shutil.rmtree(self._folder, ignore_errors=True)
+
+    async def _note_use_again(self) -> None:
+        with contextlib.suppress(Fenced):  # the next write of the attempt itself ends it
+            while True:
+                await asyncio.sleep(self._settings.beat_s)
+                await self._note_use()
+
+    async def _note_use(self) -> None:
+        used_s = await asyncio.to_thread(self._child.processor_s) if self._child else 0.0
+        await self._ledger.note_use(used_s)
 
     async def _run(self) -> Ending:
         try:
-            return await self._conclude(await self._run_process())
+            status = await self._run_process()
+            await self._note_use()
+            return await self._conclude(status)
         except Unavailable:
             return await self._wait("store_away")
         except Exception as error:
@@ -146,7 +161,7 @@ class Attempt:
         self._oom_kills_before = self._oom_kills.count()
         # What a job that is killed leaves behind goes with its folder.
         variables = {**self._variables, "TMPDIR": str(self._folder / "tmp")}
-        child = await Child.start(
+        child = self._child = await Child.start(
             self._settings.job_command, self._folder, self._log, variables, nice=self._settings.job_nice
         )
         courier = Courier(self._ledger, self._files, self._output, self._log)

@@ -6,6 +6,8 @@ import asyncio
 import contextlib
 import os
 import signal
+import subprocess
+import threading
 from collections.abc import AsyncIterator, Mapping, Sequence
 from pathlib import Path
 
@@ -13,13 +15,17 @@ from workers.process.die_with_parent import dying_with_parent
 
 LINE_BYTES_MAX = 2**20
 TAIL_BYTES = 4000
+_TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
 class Child:
     """A running job process. Its standard output is the protocol, its standard error the log."""
 
-    def __init__(self, process: asyncio.subprocess.Process) -> None:
-        self._process = process
+    def __init__(self, process: subprocess.Popen[bytes], output: asyncio.StreamReader) -> None:
+        self._process, self._output = process, output
+        self._ended: asyncio.Future[int] = asyncio.get_running_loop().create_future()
+        self._processor_s: float | None = None
+        threading.Thread(target=self._reap, args=(self._ended.get_loop(),), daemon=True).start()
 
     @classmethod
     async def start(
@@ -34,17 +40,28 @@ class Child:
         # ``python -m`` would look for modules in the folder first, where a stranger's json.py may lie.
         inherited["PYTHONSAFEPATH"] = "1"
         with log.open("ab") as errors:
-            process = await asyncio.create_subprocess_exec(
-                *dying_with_parent([*command, str(folder)], signal_number=signal.SIGKILL, nice=nice),
-                stdin=asyncio.subprocess.DEVNULL,
-                stdout=asyncio.subprocess.PIPE,
+            process = subprocess.Popen(
+                dying_with_parent([*command, str(folder)], signal_number=signal.SIGKILL, nice=nice),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
                 stderr=errors,
                 cwd=folder,
                 env={**inherited, **variables},
                 start_new_session=True,
-                limit=LINE_BYTES_MAX,
             )
-        return cls(process)
+        output = asyncio.StreamReader(limit=LINE_BYTES_MAX)
+        protocol = asyncio.StreamReaderProtocol(output)
+        child = cls(process, output)
+        await asyncio.get_running_loop().connect_read_pipe(lambda: protocol, process.stdout)
+        return child
+
+    def _reap(self, loop: asyncio.AbstractEventLoop) -> None:
+        """In a thread: asyncio and `subprocess` do not say what a process used."""
+        _, status, used = os.wait4(self.pid, 0)
+        self._process.returncode = os.waitstatus_to_exitcode(status)
+        self._processor_s = used.ru_utime + used.ru_stime
+        with contextlib.suppress(RuntimeError):  # the loop is closed: nobody waits
+            loop.call_soon_threadsafe(self._ended.set_result, self._process.returncode)
 
     @property
     def pid(self) -> int:
@@ -53,10 +70,9 @@ class Child:
 
     async def lines(self) -> AsyncIterator[bytes]:
         """Lines of standard output until it closes; one longer than a mebibyte is dropped."""
-        assert self._process.stdout is not None, "started with a pipe"
         while True:
             try:
-                line = await self._process.stdout.readline()
+                line = await self._output.readline()
             except ValueError:
                 continue
             if not line:
@@ -65,7 +81,7 @@ class Child:
 
     async def wait(self) -> int:
         """Exit status (negative: killed by that signal), after taking its descendants down too."""
-        status = await self._process.wait()
+        status = await asyncio.shield(self._ended)
         self.kill()
         return status
 
@@ -73,15 +89,31 @@ class Child:
         """Ask it to write a checkpoint and exit; kill it when it takes longer than ``grace_s``."""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.pid, signal.SIGTERM)
-        try:
-            await asyncio.wait_for(self._process.wait(), grace_s)
-        except TimeoutError:
+        await asyncio.wait({self._ended}, timeout=grace_s)
+        if not self._ended.done():
             self.kill()
 
     def kill(self) -> None:
         """Kill the process and all it started."""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.pid, signal.SIGKILL)
+
+    def processor_s(self) -> float:
+        """User and system seconds of the process and its descendants until now.
+
+        While it runs, of all processes of its session, from /proc (proc_pid_stat(5)); after its end what the kernel
+        counted (wait4(2)), without descendants that it did not wait for.
+        """
+        if self._processor_s is not None:
+            return self._processor_s
+        ticks = 0
+        for stat in Path("/proc").glob("[0-9]*/stat"):
+            with contextlib.suppress(OSError):
+                # From the third on: the name before them may hold anything.
+                values = stat.read_bytes().rpartition(b")")[2].split()
+                if int(values[3]) == self.pid:
+                    ticks += sum(map(int, values[11:15]))
+        return ticks / _TICKS_PER_S
 
 
 def log_tail(log: Path) -> str:

@@ -34,7 +34,8 @@ class Conflict(EngineError):
 class LimitReached(EngineError):
     """A configured limit is reached.
 
-    Codes: ``body_too_large``, ``too_many_files``, ``queue_full``, ``quota_exhausted``, ``storage_full``.
+    Codes: ``body_too_large``, ``too_many_files``, ``queue_full``, ``quota_exhausted``, ``daily_limit_reached``,
+    ``storage_full``.
     """
 
 

@@ -124,6 +124,9 @@ class Settings(BaseSettings):
     tenant_max_stored_bytes: int = Field(
         100 * GIB, ge=0, description="Bytes of one tenant's datasets, uploads and results; 0: no limit."
     )
+    tenant_max_daily_seconds: int = Field(
+        0, ge=0, description="Seconds that one tenant's jobs may run in a day (UTC), added up; 0: no limit."
+    )
 
     max_files: int = Field(1000, ge=1, description="Files in a dataset.")
     max_file_bytes: int = Field(2 * GIB, ge=1, description="Size of one file of a dataset.")

@@ -7,10 +7,14 @@ A store bound to a tenant sees nothing of the others. Turns and limits are kept 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
+from datetime import date
+
+from psycopg import sql
 
 from biresnerf.errors import InputError
 from biresnerf.wire.jobs import PriorityName
-from biresnerf.wire.service import TenantShare
+from biresnerf.wire.service import TenantShare, UsageKey, UsageRow
 from workers.database.database import Connection, Database
 from workers.records import PRIORITIES, priority_name
 from workers.settings.errors import NotFound
@@ -32,10 +36,13 @@ class TenantStore:
 
     async def apply_defaults(self, settings: Settings) -> None:
         """Make the limits of the settings those of every tenant that has none of its own."""
-        values = (settings.tenant_max_running, settings.tenant_max_queued, settings.tenant_max_stored_bytes)
+        values = (
+            *(settings.tenant_max_running, settings.tenant_max_queued),
+            *(settings.tenant_max_stored_bytes, settings.tenant_max_daily_seconds),
+        )
+        columns = "(max_running, max_queued, max_stored_bytes, max_daily_seconds)"
         await self._database.fetch(
-            "UPDATE tenant_defaults SET max_running = %s, max_queued = %s, max_stored_bytes = %s"
-            " WHERE (max_running, max_queued, max_stored_bytes) <> (%s, %s, %s)",
+            f"UPDATE tenant_defaults SET {columns} = (%s, %s, %s, %s) WHERE {columns} <> (%s, %s, %s, %s)",
             *(*values, *values),
         )
 
@@ -50,13 +57,35 @@ class TenantStore:
         """All tenants, by name, or the one."""
         rows = await self._database.fetch(
             "SELECT tenant_limits.*, coalesce(running, 0) AS running, coalesce(queued, 0) AS queued,"
-            " stored_bytes_of(id) AS stored_bytes FROM tenant_limits LEFT JOIN tenant_jobs ON tenant = id"
+            " stored_bytes_of(id) AS stored_bytes, seconds_today(id) AS seconds_today"
+            " FROM tenant_limits LEFT JOIN tenant_jobs ON tenant = id"
             " WHERE id = coalesce(%s, id) ORDER BY id",
             tenant,
         )
         return tuple(
             TenantShare(**{**row, "top_priority": priority_name(row["top_priority"])}) for row in rows
         )
+
+    async def usage(
+        self,
+        first: date,
+        last: date,
+        by: Sequence[UsageKey],
+        tenant: str | None,
+        limit: int,
+    ) -> tuple[UsageRow, ...]:
+        """What attempts used that ended from ``first`` to ``last`` (UTC), of all tenants or one: sums ``by`` these."""
+        columns = sql.SQL(", ").join(sql.Identifier("key_id" if key == "key" else key) for key in by)
+        rows = await self._database.fetch(
+            sql.SQL(
+                "SELECT {columns}, sum(attempts)::bigint AS attempts, sum(processor_s) AS processor_s,"
+                " sum(wall_s) AS wall_s, coalesce(sum(wall_s) FILTER (WHERE device = 'gpu'), 0) AS gpu_s"
+                " FROM use_records WHERE day BETWEEN %s AND %s AND tenant = coalesce(%s, tenant)"
+                " GROUP BY {columns} ORDER BY {columns} LIMIT %s"
+            ).format(columns=columns),
+            *(first, last, tenant, limit),
+        )
+        return tuple(UsageRow(**row) for row in rows)
 
     async def set(
         self,
@@ -67,6 +96,7 @@ class TenantStore:
         max_running: int | None = None,
         max_queued: int | None = None,
         max_stored_bytes: int | None = None,
+        max_daily_seconds: int | None = None,
     ) -> TenantShare:
         """Change what is given (a limit of -1: what the settings say again); makes the tenant if it is new.
 
@@ -79,8 +109,9 @@ class TenantStore:
                 "UPDATE tenants SET weight = coalesce(%s, weight), top_priority = coalesce(%s, top_priority),"
                 " max_running = nullif(coalesce(%s, max_running, -1), -1),"
                 " max_queued = nullif(coalesce(%s, max_queued, -1), -1),"
-                " max_stored_bytes = nullif(coalesce(%s, max_stored_bytes, -1), -1) WHERE id = %s",
-                (weight, top, max_running, max_queued, max_stored_bytes, tenant),
+                " max_stored_bytes = nullif(coalesce(%s, max_stored_bytes, -1), -1),"
+                " max_daily_seconds = nullif(coalesce(%s, max_daily_seconds, -1), -1) WHERE id = %s",
+                (weight, top, max_running, max_queued, max_stored_bytes, max_daily_seconds, tenant),
             )
             await connection.execute("SELECT offer_held(%s)", (tenant,))
         return await self.share(tenant)

@@ -166,6 +166,7 @@ async def test_nothing_is_written_once_another_attempt_owns_the_job(database: Da
     before = await database.fetch("SELECT * FROM jobs")
     for write in (
         ledger.progress(Progress(stage="coarse")),
+        ledger.note_use(1.0),
         ledger.checkpoint("jobs/x/1", ["a"], 1),
         ledger.preview("jobs/x/1", [FILE], Progress(stage="coarse")),
         ledger.reusable("coarse", "jobs/x/1", ["a"]),

@@ -132,6 +132,8 @@ def claimed(name: str, worker: int, token: uuid.UUID | None) -> Change:
         job = world.jobs[name]
         if job.final or job.place != "doing" or job.worker != worker:
             return False, world
+        if job.state == "running":  # its last attempt is fenced, which never said how it ended
+            job = replace(job, token=None)
         if job.cancel_requested:
             return False, world.with_job(name, job.ended("cancelled"))
         if job.crashes >= MAX_CRASHES or job.losses >= MAX_LOSSES or job.attempt >= MAX_ATTEMPTS:

@@ -10,16 +10,19 @@ CREATE TABLE tenants (
     max_running int CHECK (max_running >= 0),
     max_queued int CHECK (max_queued >= 0),
     max_stored_bytes bigint CHECK (max_stored_bytes >= 0),
+    max_daily_seconds bigint CHECK (max_daily_seconds >= 0),
     created_at timestamptz NOT NULL DEFAULT clock_timestamp()
 );
-INSERT INTO tenants (id, top_priority, max_running, max_queued, max_stored_bytes) VALUES ('local', 1, 0, 0, 0);
+INSERT INTO tenants (id, top_priority, max_running, max_queued, max_stored_bytes, max_daily_seconds)
+    VALUES ('local', 1, 0, 0, 0, 0);
 
 -- Written by the web process from its settings.
 CREATE TABLE tenant_defaults (
     one boolean PRIMARY KEY DEFAULT true CHECK (one),
     max_running int NOT NULL DEFAULT 0,
     max_queued int NOT NULL DEFAULT 0,
-    max_stored_bytes bigint NOT NULL DEFAULT 0
+    max_stored_bytes bigint NOT NULL DEFAULT 0,
+    max_daily_seconds bigint NOT NULL DEFAULT 0
 );
 INSERT INTO tenant_defaults DEFAULT VALUES;
 
@@ -27,7 +30,8 @@ CREATE VIEW tenant_limits AS
     SELECT tenants.id, tenants.weight, tenants.top_priority,
         coalesce(tenants.max_running, usual.max_running) AS max_running,
         coalesce(tenants.max_queued, usual.max_queued) AS max_queued,
-        coalesce(tenants.max_stored_bytes, usual.max_stored_bytes) AS max_stored_bytes
+        coalesce(tenants.max_stored_bytes, usual.max_stored_bytes) AS max_stored_bytes,
+        coalesce(tenants.max_daily_seconds, usual.max_daily_seconds) AS max_daily_seconds
     FROM tenants CROSS JOIN tenant_defaults AS usual;
 
 -- Of a key only the SHA-256 is kept; `prefix` is its public part, by which it is found and shown.
@@ -137,6 +141,8 @@ $$;
 -- job's fault and counts apart; `setback`: why the last attempt ended before its job did. `slot_kind`: of the slot that
 -- runs the job, or ran it last. `fixed_from`: the job whose result this one joins its photos to. (No reference: what
 -- was joined stays when the other is deleted.) `share_round`: signed into links to its files; the next one ends them.
+-- `key_id`: the API key that submitted it. `attempt_…`: of the latest attempt, when it began, when it was last known to
+-- run, and its processor seconds until then; `processor_s`, `wall_s`, `gpu_s`: what all attempts that are over used.
 -- fillfactor leaves space in each page, so that progress updates stay HOT (no index writes).
 CREATE TABLE jobs (
     id text PRIMARY KEY,
@@ -168,6 +174,13 @@ CREATE TABLE jobs (
     setback text CHECK (setback IN ('worker_lost', 'killed', 'error', 'disk_full', 'store_away')),
     slot_kind text,
     run_token uuid,
+    key_id text,
+    attempt_started_at timestamptz,
+    attempt_seen_at timestamptz,
+    attempt_processor_s double precision NOT NULL DEFAULT 0,
+    processor_s double precision NOT NULL DEFAULT 0,
+    wall_s double precision NOT NULL DEFAULT 0,
+    gpu_s double precision NOT NULL DEFAULT 0,
     cancel_requested boolean NOT NULL DEFAULT false,
     keep_partial boolean NOT NULL DEFAULT false,
     partial boolean NOT NULL DEFAULT false,
@@ -266,6 +279,19 @@ CREATE VIEW queue_depth AS
         FROM jobs WHERE state IN ('queued', 'running')
     ) AS job ON true
     GROUP BY kinds.slot_kind ORDER BY kinds.slot_kind;
+
+-- What attempts used, by the day (UTC) on which they ended; it stays when jobs are deleted. Each attempt is a row of its
+-- own first, so that no two jobs wait for one another; a janitor adds the rows up. `key_id` is empty without a key.
+CREATE TABLE use_records (
+    day date NOT NULL DEFAULT (clock_timestamp() AT TIME ZONE 'UTC')::date,
+    tenant text NOT NULL,
+    key_id text NOT NULL,
+    device text NOT NULL CHECK (device IN ('cpu', 'gpu')),
+    attempts bigint NOT NULL DEFAULT 1,
+    processor_s double precision NOT NULL,
+    wall_s double precision NOT NULL
+);
+CREATE INDEX use_records_of_tenant ON use_records (tenant, day);
 
 -- Links that show the page of one job to people without a key. Like a key, only the SHA-256 of the text is stored.
 CREATE TABLE result_links (

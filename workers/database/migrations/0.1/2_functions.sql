@@ -120,6 +120,40 @@ CREATE CONSTRAINT TRIGGER make_room AFTER UPDATE OF state ON jobs DEFERRABLE INI
     WHEN (OLD.state IN ('queued', 'running') AND NEW.state NOT IN ('queued', 'running'))
     EXECUTE FUNCTION make_room();
 
+-- Adds up what an attempt used, once: when its job stops running, or begins another attempt while the end of this one was
+-- never written. An attempt without an end of its own (its token is gone, or another's) counts until it was last seen.
+-- An export runs beside the refinement that has the slot's device. Metrics name the first 100 tenants.
+CREATE FUNCTION add_use() RETURNS trigger LANGUAGE plpgsql AS $$
+DECLARE
+    _lost boolean := NEW.run_token IS NULL OR NEW.attempt > OLD.attempt;
+    _wall_s double precision := greatest(0, extract(epoch FROM
+        CASE WHEN _lost THEN OLD.attempt_seen_at ELSE clock_timestamp() END - OLD.attempt_started_at));
+    _device text := CASE WHEN OLD.kind = 'refine' AND OLD.slot_kind = 'gpu' THEN 'gpu' ELSE 'cpu' END;
+    _gpu_s double precision := CASE _device WHEN 'gpu' THEN _wall_s ELSE 0 END;
+    _label text := CASE WHEN (SELECT count(*) FROM tenants, (SELECT created_at, id FROM tenants WHERE id = OLD.tenant) AS own
+        WHERE (tenants.created_at, tenants.id) < (own.created_at, own.id)) < 100 THEN OLD.tenant ELSE '(others)' END;
+BEGIN
+    NEW.processor_s := OLD.processor_s + OLD.attempt_processor_s;
+    NEW.wall_s := OLD.wall_s + _wall_s;
+    NEW.gpu_s := OLD.gpu_s + _gpu_s;
+    INSERT INTO use_records (tenant, key_id, device, processor_s, wall_s)
+        VALUES (OLD.tenant, coalesce(OLD.key_id, ''), _device, OLD.attempt_processor_s, _wall_s);
+    INSERT INTO tally_log (name, label, amount) VALUES ('processor_seconds', _label, OLD.attempt_processor_s),
+        ('wall_seconds', _label, _wall_s), ('gpu_seconds', _label, _gpu_s);
+    RETURN NEW;
+END;
+$$;
+CREATE TRIGGER add_use BEFORE UPDATE OF state ON jobs FOR EACH ROW
+    WHEN (OLD.state = 'running' AND (NEW.state <> 'running' OR NEW.attempt > OLD.attempt)) EXECUTE FUNCTION add_use();
+
+-- Seconds that a tenant's jobs have run today (UTC), those that run now included.
+CREATE FUNCTION seconds_today(_tenant text) RETURNS double precision LANGUAGE sql AS $$
+    SELECT (SELECT coalesce(sum(wall_s), 0) FROM use_records
+            WHERE tenant = _tenant AND day = (clock_timestamp() AT TIME ZONE 'UTC')::date)
+        + (SELECT coalesce(sum(extract(epoch FROM clock_timestamp() - attempt_started_at)), 0)::float8 FROM jobs
+            WHERE tenant = _tenant AND state = 'running')
+$$;
+
 -- What a tenant has stored: files of datasets, results, and of uploads what their datasets do not count yet.
 CREATE FUNCTION count_stored_bytes() RETURNS trigger LANGUAGE plpgsql AS $$
 BEGIN
