@@ -64,6 +64,7 @@ SECTIONS = (
             "fork": "biresnerf.commands.jobs.fork:fork_command",
             "cancel": "biresnerf.commands.jobs.jobs:cancel_command",
             "delete": "biresnerf.commands.jobs.jobs:delete_command",
+            "mcp": "biresnerf.commands.jobs.assistant_tools:mcp_command",
         },
     ),
     Section(

@@ -191,7 +191,7 @@ def imported(package: str) -> dict[str, str]:
 @pytest.mark.parametrize(
     ("package", "extras"),
     [
-        ("biresnerf", ["client", "colmap", "photos", "markers", "studies", "view"]),
+        ("biresnerf", ["client", "colmap", "photos", "markers", "mcp", "studies", "view"]),
         ("workers", ["service", "otel"]),
         ("service", ["service"]),
     ],

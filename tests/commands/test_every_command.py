@@ -15,7 +15,7 @@ from docs.generate.commands_page import ROOT, all_commands
 
 COMMANDS = all_commands()
 # They run until they are stopped; or what they print is a script, or a story.
-WITHOUT_JSON = {"api", "dispatcher", "up", "view", "worker", "completion", "demo"}
+WITHOUT_JSON = {"api", "dispatcher", "mcp", "up", "view", "worker", "completion", "demo"}
 
 
 def test_the_page_of_commands_and_the_help_have_a_place_for_each() -> None:

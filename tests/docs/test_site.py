@@ -87,3 +87,9 @@ def test_the_site_is_searched_where_it_was_opened_as_files(site):
     assert first is not None
     assert "/docs/estimator.html" in first
     assert [address for address in asked if not address.startswith("file:")] == []
+
+
+def test_the_pages_that_llms_txt_names_are_there():
+    names = re.findall(r"\]\(([^)]+)\)", (ROOT / "docs/llms.txt").read_text("utf-8"))
+    assert len(names) > 15
+    assert [name for name in names if not (ROOT / "docs" / name).is_file()] == []

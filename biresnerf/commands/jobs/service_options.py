@@ -64,15 +64,15 @@ def service_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 @contextmanager
-def client_extra() -> Iterator[None]:
-    """Around imports of the client; raises `InputError` (``extra_missing``)."""
+def client_extra(extra: str = "client") -> Iterator[None]:
+    """Around imports of what an extra of this package installs; raises `InputError` (``extra_missing``)."""
     try:
         yield
     except ModuleNotFoundError as error:
         raise InputError(
             "extra_missing",
             f"The package {error.name} is not installed.",
-            hint="Install it with: pip install 'biresnerf[client]'",
+            hint=f"Install it with: pip install 'biresnerf[{extra}]'",
         ) from None
 
 
