@@ -15,7 +15,7 @@ import pytest
 import yaml
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
-from tests.deploy.keda_schemas import BY_KIND
+from tests.deploy.custom_schemas import BY_KIND
 from tests.deploy.manifests import (
     MANIFESTS,
     OVERLAYS,
@@ -38,7 +38,7 @@ each_overlay = pytest.mark.parametrize("overlay", OVERLAYS)
 
 
 def violations(manifests: list[Manifest] | tuple[Manifest, ...], version: str) -> Iterator[str]:
-    """Where objects differ from the schemas of Kubernetes and KEDA."""
+    """Where objects differ from the schemas of Kubernetes, KEDA and Kueue."""
     for item in manifests:
         kind = item["kind"]
         checked = item
@@ -48,7 +48,8 @@ def violations(manifests: list[Manifest] | tuple[Manifest, ...], version: str) -
             except jsonschema.ValidationError as error:
                 yield f"{kind}: {error.message}"
             # What KEDA makes of it: an object with the same metadata, and a Job.
-            spec = item["spec"].get("jobTargetRef", {"template": {"spec": {"containers": []}}})
+            empty = {"template": {"spec": {"containers": []}}}
+            spec = item.get("spec", {}).get("jobTargetRef", empty)
             checked = {"apiVersion": "batch/v1", "kind": "Job", "metadata": item["metadata"], "spec": spec}
         try:
             kubernetes_validate.validate(checked, version, strict=True)
@@ -306,3 +307,32 @@ def test_the_overlay_of_the_page_renders_with_the_readers_names(tmp_path: Path):
         "10.0.8.5/32",
         "10.0.9.0/28",
     ]
+
+
+@each_overlay
+def test_workers_wait_for_what_kueue_grants_them(overlay: str, tmp_path: Path):
+    shutil.copytree(MANIFESTS, tmp_path / "kubernetes")
+    own = tmp_path / "kubernetes/overlays/mine"
+    own.mkdir()
+    (line,) = re.findall(r"^components: .*", PAGE, re.MULTILINE)
+    kustomization = {"apiVersion": "kustomize.config.k8s.io/v1beta1", "kind": "Kustomization"}
+    (own / "kustomization.yaml").write_text(
+        yaml.safe_dump({**kustomization, "resources": [f"../{overlay}"], **yaml.safe_load(line)})
+    )
+    found = tuple(render(own))
+    (text,) = re.findall(r"```yaml\n(apiVersion: kueue.*?)```", PAGE, re.DOTALL)
+    theirs = tuple(yaml.safe_load_all(text))
+    assert list(violations([*found, *theirs], VERSIONS[1])) == []
+    worker = only(found, "ScaledJob", "biresnerf-worker")
+    queue = only(found, "LocalQueue", worker["metadata"]["labels"]["kueue.x-k8s.io/queue-name"])
+    assert queue["metadata"]["namespace"] == worker["metadata"]["namespace"]
+    cluster = only(theirs, "ClusterQueue", queue["spec"]["clusterQueue"])["spec"]
+    (namespace,) = [item["metadata"] for item in found if item["kind"] == "Namespace"]
+    assert cluster["namespaceSelector"]["matchLabels"] == {"kubernetes.io/metadata.name": namespace["name"]}
+    (group,) = cluster["resourceGroups"]
+    resources = container(dict(pod_templates(found))["biresnerf-worker"])["resources"]
+    # A Job that asks for anything else is never admitted. What is limited and not requested counts as requested.
+    assert set(resources["requests"]) | set(resources["limits"]) <= set(group["coveredResources"])
+    for flavor in group["flavors"]:
+        only(theirs, "ResourceFlavor", flavor["name"])
+        assert [one["name"] for one in flavor["resources"]] == group["coveredResources"]

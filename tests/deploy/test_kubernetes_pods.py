@@ -24,7 +24,7 @@ import httpx
 import psycopg
 import pytest
 
-from tests.deploy.keda_schemas import workers_to_start
+from tests.deploy.custom_schemas import workers_to_start
 from tests.deploy.manifests import ROOT, Manifest, container, only, pod_templates, rendered
 from tests.service.free_port import free_port
 from tests.workers.buckets import by_boto, environment_of, fresh_bucket, moto_server

@@ -1,4 +1,4 @@
-"""What KEDA demands of the objects that we give it, in our own words, as JSON schemas.
+"""What KEDA and Kueue demand of the objects that we give them, in our own words, as JSON schemas.
 
 Written after scaledjob_types.go, scaletriggers_types.go and triggerauthentication_types.go in apis/keda/v1alpha1 and
 pkg/scalers/postgresql_scaler.go of https://github.com/kedacore/keda at commit 8b4f083 (August 2026), and after
@@ -86,7 +86,43 @@ TRIGGER_AUTHENTICATION = _object(
         },
     ),
 )
-BY_KIND = {"ScaledJob": SCALED_JOB, "TriggerAuthentication": TRIGGER_AUTHENTICATION}
+
+# Kueue's, after apis/kueue/v1beta2 of https://github.com/kubernetes-sigs/kueue at commit 013c8f2.
+_KUEUE = {"apiVersion": _one_of("kueue.x-k8s.io/v1beta2"), "metadata": _METADATA}
+_QUOTA = _object(("name", "nominalQuota"), name=_TEXT, nominalQuota={"type": ["integer", "string"]})
+_FLAVOR = _object(
+    ("name", "resources"), name=_TEXT, resources={"type": "array", "minItems": 1, "items": _QUOTA}
+)
+_GROUP = _object(
+    ("coveredResources", "flavors"),
+    coveredResources={"type": "array", "minItems": 1, "items": _TEXT},
+    flavors={"type": "array", "minItems": 1, "items": _FLAVOR},
+)
+LOCAL_QUEUE = _object(
+    ("apiVersion", "kind", "metadata", "spec"),
+    kind=_one_of("LocalQueue"),
+    spec=_object(("clusterQueue",), clusterQueue=_TEXT),
+    **_KUEUE,
+)
+CLUSTER_QUEUE = _object(
+    ("apiVersion", "kind", "metadata", "spec"),
+    kind=_one_of("ClusterQueue"),
+    spec=_object(
+        ("resourceGroups", "namespaceSelector"),  # without a selector no namespace is let in
+        resourceGroups={"type": "array", "minItems": 1, "items": _GROUP},
+        namespaceSelector=_object(matchLabels={"type": "object"}),
+        cohortName=_TEXT,
+    ),
+    **_KUEUE,
+)
+RESOURCE_FLAVOR = _object(("apiVersion", "kind", "metadata"), kind=_one_of("ResourceFlavor"), **_KUEUE)
+BY_KIND = {
+    "ScaledJob": SCALED_JOB,
+    "TriggerAuthentication": TRIGGER_AUTHENTICATION,
+    "LocalQueue": LOCAL_QUEUE,
+    "ClusterQueue": CLUSTER_QUEUE,
+    "ResourceFlavor": RESOURCE_FLAVOR,
+}
 
 
 def workers_to_start(waiting: int, unfinished: int, pending: int, most: int) -> int:
