@@ -30,6 +30,7 @@ NIGHTLY = (
     "tests/deploy/",
     "tests/docs/test_documented_commands.py",
     "tests/docs/test_notebooks.py",
+    "tests/docs/test_typescript.py",
     "tests/service/test_fuzz.py",
     "tests/studies/commands/",
     "tests/test_benchmarks.py",
