@@ -2,7 +2,7 @@
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV ?= .venv
-EXTRAS ?= service,otel,colmap,photos,markers,studies,view,mcp,docs,notebooks,dev
+EXTRAS ?= service,otel,s3,colmap,photos,markers,studies,view,mcp,docs,notebooks,dev
 # Test files side by side: more than there are cores, as many wait for servers. 0: one after the other, in this process.
 TEST_PROCESSES ?= $(shell cores=$$(nproc 2>/dev/null || echo 2); echo $$((cores + (cores + 1) / 2)))
 # Runs of `make promises`, of up to 50 steps each.

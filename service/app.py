@@ -72,7 +72,8 @@ _DESCRIPTION = """
 Refines the camera poses of an image set.
 
 1. `POST /v1/datasets`, with a manifest to learn which files to send; then `PUT …/files/{path}` for each file,
-   `POST …/archive` for all of them, or `POST …/uploads` for resumable uploads; then `POST …/finalize`.
+   `POST …/archive` for all of them, `POST …/uploads` for resumable uploads, or `POST …/fetches` for addresses that the
+   service fetches; then `POST …/finalize`.
 2. `POST /v1/jobs` with the dataset's id (or one multipart request with an archive does both).
 3. `GET /v1/jobs/{id}` or its event stream reports the progress.
 4. `GET /v1/jobs/{id}/artifacts` lists the refined poses, the report and the renders.
@@ -93,8 +94,9 @@ def create_app(settings: Settings) -> FastAPI:
             swept = await asyncio.to_thread(sweep_staging, service.staging_dir)
             if swept:
                 logger.info("removed %d unfinished uploads", swept)
-            service.keep_running(_repeat(finish_checks, service))
-            service.keep_running(_repeat(finish_uploads, service))
+            service.keep_running(_repeat(finish_checks, service, _UNFINISHED_EVERY_S))
+            # Those that a dispatcher fetched as well, for which somebody may wait.
+            service.keep_running(_repeat(finish_uploads, service, settings.poll_s))
             # Workers do the same; without any, trash and tallies would pile up.
             service.keep_running(stores.janitor.run())
             service.keep_running(_stop_if_broken(service))
@@ -139,7 +141,7 @@ def _operation_id(route: APIRoute) -> str:
     return ("head" if route.methods == {"HEAD"} else verb) + "".join(word.capitalize() for word in words)
 
 
-async def _repeat(work: Callable[[Service], Awaitable[None]], service: Service) -> None:
+async def _repeat(work: Callable[[Service], Awaitable[None]], service: Service, pause_s: float) -> None:
     """Does the work now and again, whatever happens to it."""
     while True:
         try:
@@ -148,7 +150,7 @@ async def _repeat(work: Callable[[Service], Awaitable[None]], service: Service) 
             logger.warning("unfinished checks and uploads are waiting: %s", error.detail)
         except Exception:
             logger.exception("%s failed; it will be retried", work.__name__)
-        await asyncio.sleep(_UNFINISHED_EVERY_S)
+        await asyncio.sleep(pause_s)
 
 
 async def _stop_if_broken(service: Service) -> None:
@@ -168,7 +170,7 @@ async def finish_checks(service: Service) -> None:
 
 
 async def finish_uploads(service: Service) -> None:
-    """Finishes uploads that another process received but did not store; deletes those that expired."""
+    """Finishes uploads that another process received or fetched but did not store; deletes those that expired."""
     for upload_id in await service.stores.uploads.not_imported():
         try:
             await import_upload(service, upload_id)

@@ -25,6 +25,7 @@ IMPORTED_AS = {
     "pydantic": {"pydantic", "pydantic_core"},  # its own, which it pins
     "psycopg": {"psycopg", "psycopg_pool"},  # by its extra `pool`
     "numba": {"numba", "llvmlite"},  # which pins its version
+    "boto3": {"boto3", "botocore"},  # which pins its version
     "fastapi": {"fastapi", "starlette"},  # built on it, and documented so
     "torch": {"torch", "triton"},  # in its CUDA builds, where alone it is used
 }
@@ -191,7 +192,7 @@ def imported(package: str) -> dict[str, str]:
 @pytest.mark.parametrize(
     ("package", "extras"),
     [
-        ("biresnerf", ["client", "colmap", "photos", "markers", "mcp", "studies", "view"]),
+        ("biresnerf", ["client", "colmap", "photos", "markers", "mcp", "studies", "view", "s3"]),
         ("workers", ["service", "otel"]),
         ("service", ["service"]),
     ],

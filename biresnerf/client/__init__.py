@@ -9,19 +9,23 @@ Needs the extra ``client``. Answers are the models of `biresnerf.wire`, which th
 """
 
 from biresnerf.client.blocking import Client
+from biresnerf.client.bucket_files import bucket_files
 from biresnerf.client.client import AsyncClient
 from biresnerf.client.errors import JobFailed, JobNotOver, ServiceError
 from biresnerf.client.events import StreamEvent
 from biresnerf.client.submission import Sending
 from biresnerf.client.uploads import LocalFile
+from biresnerf.wire.datasets import FileAddress
 
 __all__ = [
     "AsyncClient",
     "Client",
+    "FileAddress",
     "JobFailed",
     "JobNotOver",
     "LocalFile",
     "Sending",
     "ServiceError",
     "StreamEvent",
+    "bucket_files",
 ]

@@ -78,10 +78,13 @@ class Client:
     dataset_files = _blocking(AsyncClient.dataset_files)
     send_missing = _blocking(AsyncClient.send_missing)
     send_archive = _blocking(AsyncClient.send_archive)
+    fetch_files = _blocking(AsyncClient.fetch_files)
+    fetches = _blocking(AsyncClient.fetches)
     finalize = _blocking(AsyncClient.finalize)
     delete_dataset = _blocking(AsyncClient.delete_dataset)
 
     submit = _blocking(AsyncClient.submit)
+    submit_addresses = _blocking(AsyncClient.submit_addresses)
     create_job = _blocking(AsyncClient.create_job)
     job = _blocking(AsyncClient.job)
     jobs = _blocking(AsyncClient.jobs)

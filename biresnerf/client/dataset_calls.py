@@ -12,14 +12,19 @@ from biresnerf.wire.datasets import (
     DatasetList,
     DatasetState,
     DatasetView,
+    FileAddress,
     FileList,
     FileView,
     ManifestEntry,
     NewDataset,
+    NewFetches,
+    UploadList,
+    UploadView,
     dataset_url,
 )
 
 _POLL_S, _LONGEST_POLL_S = 0.2, 3.0
+_ADDRESSES_AT_ONCE = 100  # a body of them is limited to 1 MiB
 
 
 class DatasetCalls(Transport):
@@ -45,6 +50,22 @@ class DatasetCalls(Transport):
     async def dataset_files(self, dataset_id: str, *, limit: int | None = None) -> list[FileView]:
         """The files received, sorted by path."""
         return await self._collect(Call("GET", f"{dataset_url(dataset_id)}/files"), FileList, limit)
+
+    async def fetch_files(self, dataset_id: str, files: Sequence[FileAddress]) -> list[UploadView]:
+        """Has the service fetch files into a dataset; `finalize` waits for them."""
+        made: list[UploadView] = []
+        for start in range(0, len(files), _ADDRESSES_AT_ONCE):
+            part = NewFetches(files=list(files[start : start + _ADDRESSES_AT_ONCE]))
+            # Sent twice, they are fetched twice: no harm.
+            call = Call("POST", f"{dataset_url(dataset_id)}/fetches", json=part.model_dump(mode="json"))
+            made += parse(await self._ask(call), UploadList).items
+        return made
+
+    async def fetches(self, dataset_id: str) -> list[UploadView]:
+        """What of these files is not in the dataset yet, and what was rejected."""
+        return list(
+            parse(await self._ask(Call("GET", f"{dataset_url(dataset_id)}/fetches")), UploadList).items
+        )
 
     async def finalize(self, dataset_id: str) -> DatasetView:
         """Has the dataset checked and returns it once it is ready.

@@ -1,12 +1,13 @@
-"""Submits a local folder as a job: manifest, missing files, check, queue."""
+"""Submits a set as a job: a local folder (manifest, missing files), or addresses of files; check, queue."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, Unpack
 
+import anyio
 from anyio import to_thread
 
 from biresnerf.client.dataset_calls import DatasetCalls
@@ -22,7 +23,7 @@ from biresnerf.client.job_calls import (
 from biresnerf.client.scene import look_at
 from biresnerf.client.transport import tell
 from biresnerf.client.uploads import LocalFile, Uploads
-from biresnerf.wire.datasets import DatasetView
+from biresnerf.wire.datasets import DatasetView, FileAddress
 from biresnerf.wire.jobs import JobView, NewJob
 
 
@@ -30,7 +31,7 @@ from biresnerf.wire.jobs import JobView, NewJob
 class Sending:
     """The progress of a submission. An interrupted one is resumed by its ``dataset_id``."""
 
-    step: Literal["reading", "sending", "checking", "queueing"]
+    step: Literal["reading", "sending", "fetching", "checking", "queueing"]
     files: int = 0
     files_missing: int = 0
     bytes_missing: int = 0
@@ -38,8 +39,11 @@ class Sending:
     dataset_id: str | None = None
 
 
+_POLL_S, _LONGEST_POLL_S = 0.3, 5.0  # between two looks at what the service fetches
+
+
 class Submissions(DatasetCalls, JobCalls, Uploads):
-    """Submits local folders."""
+    """Submits local folders, and files at addresses."""
 
     async def submit(
         self,
@@ -77,20 +81,85 @@ class Submissions(DatasetCalls, JobCalls, Uploads):
             target = await self.create_dataset(title, [file.entry for file in files])
         else:
             target = await self.dataset(resume)
+        body = NewJob(
+            dataset_id=target.id, options=wanted, labels=with_name(labels or {}, target.name), **details
+        )
+        filling = self._fill(target, files, on_progress)
+        return await self._submit_filled(target, filling, body, idempotency_key, resume is None, on_progress)
+
+    async def submit_addresses(
+        self,
+        files: Sequence[FileAddress],
+        options: OptionsLike = None,
+        *,
+        name: str = "scene",
+        labels: Mapping[str, str] | None = None,
+        idempotency_key: str | None = None,
+        resume: str | None = None,
+        on_progress: Callable[[Sending], object] = lambda _: None,
+        **details: Unpack[JobDetails],
+    ) -> JobView:
+        """Like `submit`, with files that the service fetches itself. It goes on without the caller.
+
+        Args:
+            files: where they are; see `bucket_files` for those of a bucket.
+            resume: the dataset of an interrupted submission, whose files are fetched already or soon.
+
+        Raises:
+            ServiceError: also where an address leads to no file, or to another one than was announced.
+        """
+        wanted = as_options(options)
+        target = await (self.create_dataset(name[:200]) if resume is None else self.dataset(resume))
+        body = NewJob(
+            dataset_id=target.id, options=wanted, labels=with_name(labels or {}, target.name), **details
+        )
+        filling = self._fetch(target, () if resume is not None else files, on_progress)
+        return await self._submit_filled(target, filling, body, idempotency_key, resume is None, on_progress)
+
+    async def _submit_filled(
+        self,
+        target: DatasetView,
+        filling: Awaitable[DatasetView],
+        body: NewJob,
+        idempotency_key: str | None,
+        fresh: bool,
+        on_progress: Callable[[Sending], object],
+    ) -> JobView:
         try:
-            ready = await self._fill(target, files, on_progress)
-            await tell(on_progress, Sending("queueing", len(files), dataset_id=target.id))
-            body = NewJob(
-                dataset_id=ready.id,
-                options=wanted,
-                labels=with_name(labels or {}, target.name),
-                **details,
-            )
+            ready = await filling
+            await tell(on_progress, Sending("queueing", ready.files, dataset_id=target.id))
             return await self._queue("/v1/jobs", body, idempotency_key or idempotency_key_of(body))
         except ServiceError as error:
-            if error.users_fault and resume is None:
+            if error.users_fault and fresh:
                 await self._discard(target, error)
             raise
+
+    async def _fetch(
+        self, target: DatasetView, files: Sequence[FileAddress], on_progress: Callable[[Sending], object]
+    ) -> DatasetView:
+        """Has the files fetched and the dataset checked."""
+        if target.state == "ready":
+            return target
+        if files:
+            await self.fetch_files(target.id, files)
+        pause_s, state = _POLL_S, Sending("fetching", len(files), dataset_id=target.id)
+        while pending := await self.fetches(target.id):
+            rejected = next((each.error for each in pending if each.error is not None), None)
+            if rejected is not None:
+                raise ServiceError.of(rejected, status=422)
+            total = max(state.bytes_missing, sum(each.size for each in pending))
+            state = replace(
+                state,
+                files=max(state.files, len(pending)),
+                files_missing=len(pending),
+                bytes_missing=total,
+                bytes_sent=total - sum(each.size - each.received for each in pending),
+            )
+            await tell(on_progress, state)
+            await anyio.sleep(pause_s)
+            pause_s = min(1.5 * pause_s, _LONGEST_POLL_S)
+        await tell(on_progress, replace(state, step="checking"))
+        return await self.finalize(target.id)
 
     async def _fill(
         self, target: DatasetView, files: list[LocalFile], on_progress: Callable[[Sending], object]

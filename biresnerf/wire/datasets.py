@@ -193,8 +193,15 @@ class UploadView(Record):
     dataset_id: str = Field(examples=["ds_01JD8Y3V1QKZ5M0C7W2N4T6XAB"])
     kind: UploadKind
     path: str | None = Field(None, description="The file's path; null for an archive.")
-    size: int = Field(examples=[48_211_034])
+    size: int = Field(
+        examples=[48_211_034], description="Of a fetched file, what is known of it while it is `receiving`."
+    )
     sha256: str | None = None
+    host: str | None = Field(
+        None,
+        examples=[None],
+        description="The host that it is fetched from; null for bytes that the client sends.",
+    )
     state: UploadState
     received: int = Field(
         examples=[16_777_216], description="Bytes received and stored: the offset of the next byte to send."
@@ -202,6 +209,38 @@ class UploadView(Record):
     error: JobError | None = Field(None, examples=[None], description="Why it was rejected.")
     created_at: datetime
     expires_at: datetime = Field(description="When it is deleted if no more bytes arrive.")
+
+
+class UploadList(Record):
+    """Uploads of a dataset, oldest first."""
+
+    items: tuple[UploadView, ...]
+
+
+class FileAddress(Record):
+    """Where the service is to fetch a file, or an archive of files."""
+
+    url: str = Field(
+        max_length=8000,
+        repr=False,
+        examples=["https://bucket.s3.amazonaws.com/set/0001.jpg?X-Amz-Signature=…"],
+        description="https; it is forgotten once the file was fetched.",
+    )
+    path: str | None = Field(
+        None, max_length=4096, examples=["0001.jpg"], description="Null: it is a zip, tar or tar.gz."
+    )
+    size: int | None = Field(None, ge=0, lt=2**53)
+    sha256: str | None = Field(None, pattern="^[0-9a-f]{64}$")
+
+
+class NewFetches(Record):
+    """Files that the service is to fetch."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{"files": [{"url": "https://photos.example.org/set.zip"}]}]}
+    )
+
+    files: list[FileAddress] = Field(min_length=1, max_length=1000)
 
 
 class FileToSend(Record):

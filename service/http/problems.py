@@ -66,6 +66,8 @@ CATALOGUE: dict[str, tuple[int, str]] = {
     "unsafe_path": (422, "A file name is not safe"),
     "name_collision": (422, "Two file names differ only in case or accents"),
     "archive_rejected": (422, "The archive is not acceptable"),
+    "address_refused": (422, "Files at this address are not fetched"),
+    "fetch_failed": (422, "The file could not be fetched"),
     "webhook_url_refused": (422, "Webhooks to this address are not allowed"),
     "digest_mismatch": (422, "The digest of the bytes is not the announced one"),
     "dataset_invalid": (422, "The images and poses cannot be used"),

@@ -27,7 +27,8 @@ logger = logging.getLogger(__name__)
 
 RATIO_MAX = 200.0
 _CHUNK = 2**20
-_POLL_S = 0.3  # between two looks at an upload that another process stores
+# Between two looks at an upload that another process stores, and at those that are being fetched.
+_POLL_S, _FETCH_POLL_S = 0.3, 1.0
 # A folder of this name is part of the dataset, even if it is the only one in the archive.
 _KEPT_FOLDERS = {"images"}
 
@@ -173,7 +174,7 @@ async def _add_to_dataset(service: Service, upload: Upload) -> None:
 
 
 async def import_received(service: Service, dataset_id: str) -> None:
-    """Waits until everything received is in the dataset, also what other requests have just sent.
+    """Waits until everything received is in the dataset: what other requests have just sent, what is being fetched.
 
     Raises:
         ProblemError: ``dataset_not_complete`` where an upload is unfinished; what was wrong with another.
@@ -181,12 +182,15 @@ async def import_received(service: Service, dataset_id: str) -> None:
     while True:
         pending = await service.stores.uploads.of_dataset(dataset_id)
         received = [upload for upload in pending if upload.state == "received"]
-        if not received and not await service.stores.datasets.being_imported(dataset_id):
+        failed = any(upload.error for upload in pending)
+        fetched = any(upload.host is not None and upload.state == "receiving" for upload in pending)
+        busy = bool(received) or await service.stores.datasets.being_imported(dataset_id)
+        if not busy and (failed or not fetched):
             break
         for upload in received:
             await import_upload(service, upload.id)
-        await asyncio.sleep(_POLL_S)
-    for upload in pending:
+        await asyncio.sleep(_POLL_S if busy else _FETCH_POLL_S)
+    for upload in sorted(pending, key=lambda upload: upload.error is None):
         give_up = f"or give it up: DELETE /v1/uploads/{upload.id}"
         if upload.error is not None:
             raise ProblemError.of(upload.error, hint=f"{upload.error.hint} Send it again, {give_up}.".strip())

@@ -1,12 +1,23 @@
-"""Files that clients send directly to the store: signed URLs first, then verification of what arrived."""
+"""Files that do not come with a request.
+
+Clients send them directly to the store: signed URLs first, then verification of what arrived. Or the service fetches
+them from addresses.
+"""
 
 from __future__ import annotations
 
 from fastapi import APIRouter
 
-from biresnerf.wire.datasets import FileView, NewSignedUploads, SignedUpload, SignedUploads
+from biresnerf.wire.datasets import (
+    FileView,
+    NewFetches,
+    NewSignedUploads,
+    SignedUpload,
+    SignedUploads,
+    UploadList,
+)
 from biresnerf.wire.safe_paths import checked_path
-from service.http.access import Caller, DatasetWriter
+from service.http.access import Caller, DatasetWriter, ReadCaller
 from service.http.dependencies import DatasetId, UploadId
 from service.http.problems import ProblemError, declared
 from service.intake.json_body import JsonRoute
@@ -88,3 +99,32 @@ async def complete_upload(upload_id: UploadId, caller: DatasetWriter) -> FileVie
         raise ProblemError("upload_incomplete", "No bytes have arrived at the signed address.") from None
     await caller.uploads.conclude_signed(upload_id, caller.service.settings.storage_presign_s)
     return file
+
+
+@router.post(
+    "/datasets/{dataset_id}/fetches",
+    status_code=202,
+    responses=declared(
+        *("address_refused", "dataset_not_open", "body_too_large"),
+        *("too_many_files", "unsafe_path", "quota_exhausted"),
+    ),
+)
+async def fetch_files(dataset_id: DatasetId, caller: DatasetWriter, body: NewFetches) -> UploadList:
+    """Has files fetched from their addresses: an upload for each, or none where one is refused.
+
+    A file without a `path` is an archive, which is unpacked completely or not at all. `POST …/finalize` waits for all
+    of them and reports errors. Addresses may be signed; they are not shown again.
+    """
+    files = [
+        file if file.path is None else file.model_copy(update={"path": checked_path(file.path)})
+        for file in body.files
+    ]
+    return UploadList(items=await caller.uploads.fetch(dataset_id, files))
+
+
+@router.get("/datasets/{dataset_id}/fetches")
+async def list_fetches(dataset_id: DatasetId, caller: ReadCaller) -> UploadList:
+    """What is still being fetched or is not in the dataset yet, and what was rejected, oldest first."""
+    await caller.datasets.get(dataset_id)
+    pending = await caller.uploads.of_dataset(dataset_id)
+    return UploadList(items=tuple(upload for upload in pending if upload.host is not None))

@@ -135,6 +135,7 @@ class Workplace:
             r"\bkey_01J…": lambda: self._new_key()["id"],
             r"\bwhsec_…": "whsec_MfKQ9r8GKYqrTwjUPD8ILPZIo2LaLaSw",
             r"https://hooks\.example\.org/poses": "http://127.0.0.1:9/in",
+            r"https://photos\.example\.org/": "http://127.0.0.1:9/",
             r"http://127\.0\.0\.1:80[08]0": self.service.url,
             r"/backups/biresnerf": str(self.folder / "backup"),
             r"\bexamples/(?=\w+\.py)": f"{Path(__file__).resolve().parents[2]}/examples/",

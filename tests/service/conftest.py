@@ -76,11 +76,14 @@ def running_service(folder: Path, **settings: Any) -> Iterator[Running]:
         "data_dir": folder / "data",
         "job_nice": 0,  # tests wait for jobs, whatever else the machine does
         "log_level": "INFO",
-        # Receivers of webhooks live on this machine.
+        # Receivers of webhooks and senders of files live on this machine.
         "expiry_s": 0.5,
         "webhook_http": True,
         "webhook_ports": (),
         "webhook_networks": ("127.0.0.0/8",),
+        "file_address_http": True,
+        "file_address_ports": (),
+        "file_address_networks": ("127.0.0.0/8",),
         **LIMITS,
         **settings,
     }

@@ -9,11 +9,12 @@ from __future__ import annotations
 import contextlib
 import secrets
 import uuid
-from collections.abc import AsyncIterable, AsyncIterator, Iterator
+from collections.abc import AsyncIterable, AsyncIterator, Iterator, Sequence
 
 from psycopg.types.json import Jsonb
 
-from biresnerf.wire.datasets import UploadKind
+from biresnerf.errors import InputError
+from biresnerf.wire.datasets import FileAddress, UploadKind, UploadState
 from biresnerf.wire.problems import JobError
 from workers.database.database import Connection, Database, OwnedStore
 from workers.database.ids import new_id
@@ -24,6 +25,7 @@ from workers.settings.errors import Conflict, LimitReached, NotFound
 from workers.settings.settings import Settings
 from workers.store.files import FileStore
 from workers.store.trash import discard
+from workers.webhooks.outbound import Policy, checked_url
 
 # Memory for unstored pieces of all uploads of this process: the more uploads, the smaller the pieces of each.
 PIECES_BYTES = 256 * 2**20
@@ -35,6 +37,12 @@ _NEVER_STORED = JobError(
     code="storage_unavailable",
     detail="The upload arrived whole, but storing its content failed again and again.",
     hint="Send it again; the operator's log says what was wrong.",
+    retryable=True,
+)
+_NEVER_FETCHED = JobError(
+    code="fetch_failed",
+    detail="No dispatcher fetched the file in time.",
+    hint="Ask the operator whether one runs, and have it fetched again.",
     retryable=True,
 )
 _UPLOAD = "SELECT uploads.* FROM uploads JOIN datasets ON datasets.id = uploads.dataset_id"
@@ -65,31 +73,72 @@ class UploadStore(OwnedStore):
         Raises `NotFound`, `Conflict` (``dataset_not_open``), `LimitReached` (``body_too_large``,
         ``too_many_files``), `InputError` (``unsafe_path``).
         """
-        limit = self._settings.max_archive_bytes if kind == "archive" else self._settings.max_file_bytes
-        if size > limit:
-            raise LimitReached("body_too_large", f"At most {limit} bytes are accepted at once, not {size}.")
+        async with self._database.transaction() as connection:
+            await self._require_places(connection, dataset_id, 1, size)
+            state: UploadState = "receiving" if size or kind == "signed" else "received"
+            return await self._insert(connection, dataset_id, kind, size, path, sha256, state=state)
+
+    async def fetch(self, dataset_id: str, files: Sequence[FileAddress]) -> tuple[Upload, ...]:
+        """An upload for each address, whose bytes a dispatcher fetches; none where one of them cannot be.
+
+        Raises as `create` does, and `InputError` (``address_refused``).
+        """
+        policy, hosts = Policy.of_files(self._settings), []
+        for number, file in enumerate(files):
+            try:
+                hosts.append(checked_url(file.url, policy).host)
+            except InputError as error:
+                raise InputError.of(error.fault, where=file.path or f"files/{number}") from None
+        async with self._database.transaction() as connection:
+            await self._require_places(connection, dataset_id, len(files), sum(f.size or 0 for f in files))
+            made = []
+            for file, host in zip(files, hosts, strict=True):
+                kind: UploadKind = "archive" if file.path is None else "file"
+                made.append(
+                    await self._insert(
+                        connection, dataset_id, kind, file.size or 0, file.path, file.sha256, host=host
+                    )
+                )
+                await connection.execute(
+                    "INSERT INTO upload_fetches (id, url, size) VALUES (%s, %s, %s)",
+                    (made[-1].id, file.url, file.size),
+                )
+            await connection.execute("SELECT pg_notify('biresnerf_webhooks', '')")
+        return tuple(made)
+
+    async def _require_places(self, connection: Connection, dataset_id: str, count: int, size: int) -> None:
+        await require_open(connection, dataset_id, self._tenant)
+        await require_byte_quota(connection, dataset_id, size)
+        n = await connection.value("SELECT count(*) FROM uploads WHERE dataset_id = %s", dataset_id)
+        if n + count > self._settings.max_files:
+            most = self._settings.max_files
+            raise LimitReached("too_many_files", f"A dataset has at most {most} uploads at a time.")
+
+    async def _insert(
+        self,
+        connection: Connection,
+        dataset_id: str,
+        kind: UploadKind,
+        size: int,
+        path: str | None,
+        sha256: str | None,
+        *,
+        state: UploadState = "receiving",
+        host: str | None = None,
+    ) -> Upload:
+        require_size(self._settings, kind, size)
         upload_id = new_id("up")
         folder = f"datasets/{dataset_id}/uploads/{upload_id}"
         if path is not None:
             file_key(folder, path)
-        async with self._database.transaction() as connection:
-            await require_open(connection, dataset_id, self._tenant)
-            await require_byte_quota(connection, dataset_id, size)
-            n = await connection.value("SELECT count(*) FROM uploads WHERE dataset_id = %s", dataset_id)
-            if n >= self._settings.max_files:
-                raise LimitReached("too_many_files", f"A dataset has at most {n} uploads at a time.")
-            await connection.execute(
-                "INSERT INTO uploads (id, dataset_id, kind, path, size, sha256, folder, state, expires_at)"
-                " VALUES (%s, %s, %s, %s, %s, %s, %s, %s, clock_timestamp() + make_interval(secs => %s))",
-                (
-                    *(upload_id, dataset_id, kind, path, size, sha256, folder),
-                    *(
-                        "receiving" if size or kind == "signed" else "received",
-                        self._settings.upload_expiry_s,
-                    ),
-                ),
-            )
-            return await self._required(connection, upload_id)
+        row = await connection.only_row(
+            "INSERT INTO uploads (id, dataset_id, kind, path, size, sha256, folder, state, host, expires_at)"
+            " VALUES (%s, %s, %s, %s, %s, %s, %s, %s, %s, clock_timestamp() + make_interval(secs => %s))"
+            " RETURNING *",
+            *(upload_id, dataset_id, kind, path, size, sha256, folder, state, host),
+            self._settings.upload_expiry_s,
+        )
+        return record_from_row(Upload, row)
 
     async def get(self, upload_id: str) -> Upload:
         """The upload; raises `NotFound` (also where it expired)."""
@@ -113,7 +162,7 @@ class UploadStore(OwnedStore):
         was faster), `LimitReached` (``body_too_large``, ``storage_full``).
         """
         upload = await self.get(upload_id)
-        if upload.received != start or upload.kind == "signed":
+        if upload.received != start or upload.kind == "signed" or upload.host is not None:
             raise _offset_mismatch(upload)
         gathered = bytearray()
         with self._sharing():
@@ -246,12 +295,13 @@ class UploadStore(OwnedStore):
     async def expire(self) -> int:
         """Delete uploads that received nothing for ``upload_expiry_s``; returns how many.
 
-        One that is received whole but could not be stored in that time is rejected first, so that its owner sees why.
+        One that could not be fetched, or stored once it was whole, is rejected first, so that its owner sees why.
         """
         await self._give_up()
         rows = await self._database.fetch(
             "WITH gone AS (DELETE FROM uploads WHERE id IN (SELECT id FROM uploads"
-            " WHERE expires_at < clock_timestamp() AND state <> 'received' ORDER BY expires_at LIMIT %s"
+            " WHERE expires_at < clock_timestamp() AND state <> 'received'"
+            " AND (state <> 'receiving' OR host IS NULL) ORDER BY expires_at LIMIT %s"
             " FOR UPDATE SKIP LOCKED) RETURNING folder)"
             " INSERT INTO trash (prefix) SELECT folder FROM gone RETURNING id",
             EXPIRE_BATCH,
@@ -260,19 +310,30 @@ class UploadStore(OwnedStore):
 
     async def _give_up(self) -> None:
         await self._database.fetch(
-            "WITH given_up AS (UPDATE uploads SET state = 'rejected', error = %s, take_token = NULL, take_until = NULL,"
+            "WITH given_up AS (UPDATE uploads SET state = 'rejected', take_token = NULL, take_until = NULL,"
+            " error = CASE state WHEN 'received' THEN %s ELSE %s END,"
             " expires_at = clock_timestamp() + make_interval(secs => %s) WHERE id IN (SELECT id FROM uploads"
-            " WHERE expires_at < clock_timestamp() AND state = 'received'"
+            " WHERE expires_at < clock_timestamp() AND (state = 'received' OR state = 'receiving' AND host IS NOT NULL)"
             " AND (take_token IS NULL OR take_until < clock_timestamp()) LIMIT %s FOR UPDATE SKIP LOCKED)"
-            " RETURNING id, folder), pieces AS (DELETE FROM upload_pieces USING given_up WHERE upload_id = given_up.id)"
+            " RETURNING id, folder),"
+            " fetches AS (DELETE FROM upload_fetches USING given_up WHERE upload_fetches.id = given_up.id),"
+            " pieces AS (DELETE FROM upload_pieces USING given_up WHERE upload_id = given_up.id)"
             " INSERT INTO trash (prefix) SELECT folder FROM given_up",
-            *(Jsonb(_NEVER_STORED.model_dump()), self._settings.upload_expiry_s, EXPIRE_BATCH),
+            *(Jsonb(_NEVER_STORED.model_dump()), Jsonb(_NEVER_FETCHED.model_dump())),
+            *(self._settings.upload_expiry_s, EXPIRE_BATCH),
         )
 
     async def _required(self, connection: Connection, upload_id: str) -> Upload:
         sql = _UPLOAD + f" WHERE uploads.id = %s AND {MINE}"
         row = await connection.required_row(f"No upload {upload_id}.", sql, upload_id, self._tenant)
         return record_from_row(Upload, row)
+
+
+def require_size(settings: Settings, kind: UploadKind, size: int) -> None:
+    """Raises `LimitReached` (``body_too_large``)."""
+    limit = settings.max_archive_bytes if kind == "archive" else settings.max_file_bytes
+    if size > limit:
+        raise LimitReached("body_too_large", f"At most {limit} bytes are accepted at once, not {size}.")
 
 
 def _offset_mismatch(upload: Upload) -> Conflict:

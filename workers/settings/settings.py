@@ -162,6 +162,13 @@ class Settings(BaseSettings):
     webhook_give_up_days: float = Field(
         5.0, gt=0, description="Days without success until a failing webhook is disabled."
     )
+    file_address_http: bool = Field(False, description="Fetch files from addresses with http, too.")
+    file_address_ports: tuple[int, ...] = Field(
+        (443,), description="Ports that addresses of files may have; []: any port."
+    )
+    file_address_networks: tuple[Network, ...] = Field(
+        (), description="Networks that are not public but whose files users may have fetched and read."
+    )
     max_webhooks: int = Field(20, ge=0, description="Webhooks of one tenant.")
 
     disk_reserve_bytes: int = Field(

@@ -1,7 +1,7 @@
-"""The dispatcher: a small process that sends webhooks and expires results and datasets.
+"""The dispatcher: a small process that sends webhooks, fetches files, and expires results and datasets.
 
-Several may run at the same time, on any hosts: each message is claimed by one of them. Jobs need none of them; while no
-dispatcher runs, messages wait in the database.
+Several may run at the same time, on any hosts: each message and file is claimed by one of them. Jobs need none of them;
+while no dispatcher runs, messages and files wait.
 """
 
 from __future__ import annotations
@@ -13,10 +13,13 @@ import sys
 
 from workers.database.database import open_database
 from workers.database.notifications import Listener
+from workers.datasets.fetcher import Fetcher
 from workers.process.exit_status import ExitStatus
 from workers.process.waiting import first_done
 from workers.process.watchdog import end_if_broken, run_process
 from workers.settings.settings import Settings
+from workers.store.files import open_files
+from workers.store.store_identity import require_same_store
 from workers.upkeep.expiry import Expiry
 from workers.webhooks.outbound import Outbound, Policy
 from workers.webhooks.webhook_sender import WebhookSender
@@ -33,11 +36,14 @@ async def dispatch(settings: Settings, stop: asyncio.Event) -> None:
         open_database(url, connections=4, silence_s=settings.stall_s) as database,
         end_if_broken(database.broken),
     ):
+        files = open_files(settings)
+        await require_same_store(database, files)
         listener = Listener(database, settings.poll_s, WEBHOOK_CHANNEL)
         listening = asyncio.create_task(listener.run())
         sender = WebhookSender(database, listener, Outbound(Policy.of(settings)), settings)
-        expiry = Expiry(database, settings)
-        working = [asyncio.create_task(duty.run(stop)) for duty in (sender, expiry)]
+        fetcher = Fetcher(database, files, listener, Outbound(Policy.of_files(settings)), settings)
+        duties = (sender, fetcher, Expiry(database, settings))
+        working = [asyncio.create_task(duty.run(stop)) for duty in duties]
         try:
             log.info("dispatcher is ready")
             await first_done(*working)  # before `stop` only if one of them failed

@@ -63,7 +63,7 @@ def slot_specs(settings: Settings) -> list[ChildSpec]:
 
 
 def dispatcher_spec(settings: Settings) -> ChildSpec:
-    """The process that sends webhooks; on SIGTERM it finishes what it is sending."""
+    """The process that sends webhooks and fetches files; on SIGTERM it finishes what it is sending."""
     grace_s = settings.webhook_timeout_s + KILL_AFTER_S
     return ChildSpec("dispatcher", (sys.executable, "-m", "workers.upkeep.dispatcher"), stop_grace_s=grace_s)
 

@@ -1,7 +1,8 @@
-"""All outgoing requests: one POST to an address given by a user, protected against request forgery (SSRF).
+"""All outgoing requests, to addresses given by users: POST of messages, GET of files; protected against forgery (SSRF).
 
 The host name is resolved once, all its addresses are checked, and the connection uses a checked address; TLS and
-the Host header keep the name. Redirects are not followed, and the response body is not read.
+the Host header keep the name. Redirects of a POST are not followed, and its response body is not read. Those of a GET
+are: each new address is checked like the first.
 """
 
 from __future__ import annotations
@@ -11,8 +12,9 @@ import ipaddress
 import re
 import socket
 import ssl
-from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -24,7 +26,10 @@ from biresnerf.errors import InputError
 from workers.settings.addresses import Network, may_connect, parsed
 from workers.settings.settings import Settings
 
-URL_MAX = 2000
+# A signed address of a file is long: it may hold a session's token.
+URL_MAX, FILE_URL_MAX = 2000, 8000
+REDIRECTS, REDIRECTS_MAX = {301, 302, 303, 307, 308}, 5
+CONNECT_S = 10.0  # to one of a name's addresses; then the next is tried
 # Names resolved at the same time; more have to wait.
 RESOLVER_THREADS = 32
 _HOST = re.compile(rb"(?=.{1,253}$)([A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?\.)*[A-Za-z0-9-]{1,63}\.?")
@@ -33,7 +38,10 @@ Resolve = Callable[[str, int], Awaitable[Sequence[str]]]
 
 
 class Refused(Exception):
-    """Nothing was sent; ``code`` says why: ``address_refused``, ``name_not_found``, ``url_refused``."""
+    """Nothing was sent; ``code`` says why.
+
+    ``address_refused``, ``name_not_found``, ``url_refused``, and of a GET ``too_many_redirects``.
+    """
 
     def __init__(self, code: str) -> None:
         self.code = code
@@ -42,32 +50,41 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class Policy:
-    """Where the service may connect to."""
+    """Where the service may connect to; ``refusal`` is the code of the error about another address."""
 
     plain_http: bool = False
     ports: tuple[int, ...] = (443,)  # none: any
     networks: tuple[Network, ...] = ()
+    url_max: int = URL_MAX
+    refusal: str = "webhook_url_refused"
 
     @classmethod
     def of(cls, settings: Settings) -> Policy:
-        """The policy of the settings."""
+        """The policy of webhooks."""
         return cls(settings.webhook_http, settings.webhook_ports, settings.webhook_networks)
+
+    @classmethod
+    def of_files(cls, settings: Settings) -> Policy:
+        """The policy of files, of whose content users see more than of the answer to a webhook."""
+        allowed = settings.file_address_http, settings.file_address_ports, settings.file_address_networks
+        return cls(*allowed, FILE_URL_MAX, "address_refused")
 
 
 def checked_url(text: str, policy: Policy) -> httpx.URL:
-    """The parsed address, if `Outbound.post` may use it; its host is checked again at each resolution.
+    """The parsed address, if `Outbound` may use it; its host is checked again at each resolution.
 
-    Raises `InputError` (``webhook_url_refused``).
+    Raises `InputError` with the policy's code. The error does not repeat the address, which may be a secret.
     """
     try:
         url = httpx.URL(text)
         port = url.port if url.port is not None else {"https": 443}.get(url.scheme, 80)
-        reason = "It is longer than 2,000 characters." if len(text) > URL_MAX else _fault(url, port, policy)
+        too_long = f"It is longer than {policy.url_max:,} characters."
+        reason = too_long if len(text) > policy.url_max else _fault(url, port, policy)
     except (httpx.InvalidURL, ValueError, TypeError):
         reason = "It is no URL."
     if reason:
         hint = "Give the https address of a public host." if not policy.plain_http else ""
-        raise InputError("webhook_url_refused", f"This address cannot be used. {reason}", hint=hint)
+        raise InputError(policy.refusal, f"This address cannot be used. {reason}", hint=hint)
     return url
 
 
@@ -154,6 +171,38 @@ class Answer:
     retry_after: str | None
 
 
+@dataclass(frozen=True)
+class Opened:
+    """A response whose body is read by who has it; the names of its headers are in lower case."""
+
+    status: int
+    headers: Mapping[str, str]
+    chunks: AsyncIterator[bytes]
+
+
+# What can go wrong with a request that is not a fault of ours.
+TROUBLES = (Refused, TimeoutError, httpcore.TimeoutException, httpcore.NetworkError, httpcore.ProtocolError)
+
+
+def trouble_of(error: BaseException) -> tuple[str, bool]:
+    """The code of one of the `TROUBLES`, and whether another try may go better."""
+    if isinstance(error, Refused):
+        return error.code, error.code == "name_not_found"
+    if isinstance(error, httpcore.NetworkError):
+        return ("tls_failed" if _of_tls(error) else "connection_failed"), True
+    return ("not_http" if isinstance(error, httpcore.ProtocolError) else "timeout"), True
+
+
+def _of_tls(error: BaseException) -> bool:
+    while error.__cause__ is not None or error.__context__ is not None:
+        cause = error.__cause__ or error.__context__
+        assert cause is not None, "one of the two is there"
+        if isinstance(cause, ssl.SSLError):
+            return True
+        error = cause
+    return False
+
+
 class Outbound:
     """Sends to addresses given by users."""
 
@@ -177,6 +226,41 @@ class Outbound:
         Raises `Refused`, `TimeoutError` (``timeout_s`` for the whole exchange), and httpcore's
         `NetworkError` and `ProtocolError`.
         """
+        length = {"Content-Length": str(len(body))}
+        async with (
+            asyncio.timeout(timeout_s),
+            self._sent("POST", address, {**headers, **length}, body) as response,
+        ):
+            after = _headers(response).get("retry-after")
+            return Answer(response.status, after)
+
+    @asynccontextmanager
+    async def get(
+        self, address: str, headers: Mapping[str, str], *, head_s: float, idle_s: float
+    ) -> AsyncIterator[Opened]:
+        """The answer to a GET, whatever its status, after at most `REDIRECTS_MAX` redirects.
+
+        Raises as `post` does: `TimeoutError` after ``head_s`` until the last answer begins, or after ``idle_s``
+        between two chunks of its body.
+        """
+        async with AsyncExitStack() as opened:
+            async with asyncio.timeout(head_s):
+                for _ in range(REDIRECTS_MAX + 1):
+                    await opened.aclose()
+                    response = await opened.enter_async_context(self._sent("GET", address, headers))
+                    found = _headers(response)
+                    if response.status not in REDIRECTS or "location" not in found:
+                        break
+                    address = _joined(address, found["location"])
+                else:
+                    raise Refused("too_many_redirects")
+            chunks = aiter(response.aiter_stream())  # as they were sent: nothing is unpacked here
+            yield Opened(response.status, found, _steady(chunks, idle_s))
+
+    @asynccontextmanager
+    async def _sent(
+        self, method: str, address: str, headers: Mapping[str, str], body: bytes | None = None
+    ) -> AsyncIterator[httpcore.Response]:
         try:
             url = checked_url(address, self._policy)
         except InputError:
@@ -186,13 +270,34 @@ class Outbound:
             scheme=url.raw_scheme, host=url.raw_host, port=url.port, target=url.raw_path or b"/"
         )
         wire = [(b"Host", url.netloc), *((key.encode(), value.encode()) for key, value in headers.items())]
-        # A new connection for each message, so that each one uses a freshly checked address.
+        # A new connection for each request, so that each one uses a freshly checked address.
         pool = httpcore.AsyncConnectionPool(
             ssl_context=self._tls, network_backend=self._backend, max_connections=1
         )
-        async with asyncio.timeout(timeout_s), pool:
-            wire.append((b"Content-Length", str(len(body)).encode()))
-            async with pool.stream("POST", target, headers=wire, content=body) as response:
-                found = {key.lower(): value for key, value in response.headers}
-                after = found.get(b"retry-after")
-                return Answer(response.status, after.decode("latin-1") if after else None)
+        limits = {"timeout": {"connect": CONNECT_S}}
+        async with (
+            pool,
+            pool.stream(method, target, headers=wire, content=body, extensions=limits) as response,
+        ):
+            yield response
+
+
+def _headers(response: httpcore.Response) -> dict[str, str]:
+    return {key.decode("latin-1").lower(): value.decode("latin-1") for key, value in response.headers}
+
+
+def _joined(address: str, location: str) -> str:
+    try:
+        return str(httpx.URL(address).join(location))
+    except (httpx.InvalidURL, ValueError, TypeError):
+        raise Refused("url_refused") from None
+
+
+async def _steady(chunks: AsyncIterator[bytes], idle_s: float) -> AsyncIterator[bytes]:
+    while True:
+        async with asyncio.timeout(idle_s):
+            try:
+                chunk = await anext(chunks)
+            except StopAsyncIteration:
+                return
+        yield chunk

@@ -6,32 +6,28 @@ once the lease is over. Receivers see a message at least once, under the same id
 
 from __future__ import annotations
 
-import asyncio
 import base64
 import hashlib
 import hmac
 import logging
 import random
-import ssl
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
-from functools import partial
 from typing import Any, Literal
 
-import httpcore
 import psycopg
 
 from biresnerf import __version__
 from biresnerf.wire.webhooks import key_of
+from workers.database.claimed_work import ClaimedWork
 from workers.database.database import Connection, Database
 from workers.database.notifications import Listener
-from workers.process.waiting import first_done
 from workers.settings.errors import Unavailable
 from workers.settings.settings import Settings
-from workers.webhooks.outbound import Outbound, Refused
+from workers.webhooks.outbound import TROUBLES, Outbound, trouble_of
 from workers.webhooks.webhooks import drop_pending
 
 log = logging.getLogger(__name__)
@@ -78,44 +74,22 @@ class Result:
     retry_after_s: float = 0.0
 
 
-class WebhookSender:
-    """Runs in every dispatcher; several may."""
+class WebhookSender(ClaimedWork):
+    """Runs in every dispatcher; several may. At the end it finishes what is under way."""
+
+    at_once = IN_FLIGHT_MAX
 
     def __init__(
         self, database: Database, listener: Listener, outbound: Outbound, settings: Settings
     ) -> None:
-        self._database, self._listener = database, listener
-        self._outbound, self._settings = outbound, settings
-        self._sending: set[asyncio.Task[None]] = set()
-
-    async def run(self, stop: asyncio.Event) -> None:
-        """Claim and send until ``stop``; then what is under way is finished."""
-        with self._listener.waiting("") as woken:
-            while not stop.is_set():
-                woken.clear()  # before looking: what comes during the look is not missed
-                room = IN_FLIGHT_MAX - len(self._sending)
-                try:
-                    claimed = await self._claim(room) if room else []
-                except (Unavailable, psycopg.Error) as error:
-                    log.warning("no webhook can be sent now: %s", error)
-                    claimed = []
-                for row in claimed:
-                    task = asyncio.create_task(self._send(row))
-                    self._sending.add(task)
-                    task.add_done_callback(partial(self._sent, woken))
-                if len(claimed) < room or not room:
-                    await first_done(woken.wait(), stop.wait(), asyncio.sleep(self._settings.poll_s))
-        await asyncio.gather(*self._sending)
-
-    def _sent(self, woken: asyncio.Event, task: asyncio.Task[None]) -> None:
-        self._sending.discard(task)
-        woken.set()
+        super().__init__(listener, settings.poll_s)
+        self._database, self._outbound, self._settings = database, outbound, settings
 
     async def _claim(self, room: int) -> list[dict[str, Any]]:
         lease_s = self._settings.webhook_timeout_s + LEASE_SPARE_S
         return await self._database.fetch(_CLAIM, PER_WEBHOOK, PER_FAILING, lease_s, PER_TENANT, room)
 
-    async def _send(self, row: dict[str, Any]) -> None:
+    async def _work(self, row: dict[str, Any]) -> None:
         began, at = time.monotonic(), datetime.now(UTC)
         body = row["body"].encode()
         valid = [secret for secret in (row["secret"], row["previous"]) if secret]
@@ -136,14 +110,9 @@ class WebhookSender:
         limit = self._settings.webhook_timeout_s
         try:
             answer = await self._outbound.post(url, body, headers, timeout_s=limit)
-        except Refused as refused:
-            return Result("again" if refused.code == "name_not_found" else "failed", error=refused.code)
-        except (TimeoutError, httpcore.TimeoutException):
-            return Result("again", error="timeout")
-        except httpcore.NetworkError as error:
-            return Result("again", error="tls_failed" if _of_tls(error) else "connection_failed")
-        except httpcore.ProtocolError:
-            return Result("again", error="not_http")
+        except TROUBLES as error:
+            code, again = trouble_of(error)
+            return Result("again" if again else "failed", error=code)
         except Exception:
             # Our own failure on this one message must not repeat every minute without end.
             log.exception("webhook message %s could not be sent", headers["webhook-id"])
@@ -236,16 +205,6 @@ def retry_after(header: str | None) -> float:
         return 0.0
     wait_s = ((at if at.tzinfo else at.replace(tzinfo=UTC)) - datetime.now(UTC)).total_seconds()
     return min(max(wait_s, 0.0), PAUSE_MAX_S)
-
-
-def _of_tls(error: BaseException) -> bool:
-    while error.__cause__ is not None or error.__context__ is not None:
-        cause = error.__cause__ or error.__context__
-        assert cause is not None, "one of the two is there"
-        if isinstance(cause, ssl.SSLError):
-            return True
-        error = cause
-    return False
 
 
 def signed_headers(delivery_id: str, at: int, body: bytes, valid: Sequence[str]) -> dict[str, str]:

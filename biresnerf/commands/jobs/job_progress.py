@@ -118,6 +118,8 @@ class SendingView(BytesView):
             known = f"; the service has {there} already" if there else ""
             size = f"{sending.bytes_missing / 1e6:.1f} MB"
             self.note(f"sending {sending.files_missing} of {sending.files} files, {size}{known}")
+        elif begins and sending.step == "fetching":
+            self.note(f"the service fetches {sending.files_missing} files")
         elif begins and sending.step == "checking":
             self.note("checking the files")
         self._show(sending.bytes_missing)

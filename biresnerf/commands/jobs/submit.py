@@ -1,11 +1,13 @@
-"""`biresnerf submit PATH`: sends a local scene to a service and fetches the result."""
+"""`biresnerf submit PATH`: sends a set to a service, or says where it is, and fetches the result."""
 
 from __future__ import annotations
 
 import shlex
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 import click
 
@@ -18,7 +20,7 @@ from biresnerf.commands.jobs.service_options import service_at, service_options
 from biresnerf.commands.settings_option import budget_option, settings_option
 
 if TYPE_CHECKING:
-    from biresnerf.client import Client, Sending
+    from biresnerf.client import Client, FileAddress, Sending
     from biresnerf.options.refine_options import RefineOptions
     from biresnerf.wire.jobs import JobView
 
@@ -43,8 +45,17 @@ label_option = click.option(
 )
 
 
+class _SetParameter(click.ParamType):
+    """A local path, or an address as it is."""
+
+    name = "path"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path | str:
+        return value if "://" in str(value) else Path(value)
+
+
 @click.command("submit")
-@click.argument("path", type=click.Path(path_type=Path))
+@click.argument("path", type=_SetParameter())
 @click.option("--preset", help="fast, balanced, quality or paper.")
 @budget_option
 @settings_option
@@ -63,7 +74,7 @@ label_option = click.option(
 @service_options
 @json_option
 def submit_command(
-    path: Path,
+    path: Path | str,
     preset: str | None,
     time_budget_s: float | None,
     settings: dict[str, Any],
@@ -79,6 +90,9 @@ def submit_command(
 
     PATH is a folder of images, or a file with poses in one. Sends only files that the service lacks, and prints the
     job's address. Ctrl-C while waiting leaves the job running.
+
+    PATH may also be the address of an archive (https://...), or a folder or archive in a bucket (s3://bucket/prefix).
+    The service fetches these itself. Addresses of a bucket are signed here: your credentials stay on this machine.
     """
     from biresnerf.options.refine_options import parse_options
 
@@ -93,8 +107,11 @@ def submit_command(
         see_through(client, job, wait=wait, timeout_s=timeout_s, output=output, as_json=as_json)
 
 
-def submitted(client: Client, path: Path, options: RefineOptions, **how: Any) -> JobView:
-    """Submits a folder with progress on standard error. After Ctrl-C it prints the command that resumes."""
+def submitted(client: Client, path: Path | str, options: RefineOptions, **how: Any) -> JobView:
+    """Submits a folder or what is at an address, with progress on standard error.
+
+    After Ctrl-C it prints the command that resumes.
+    """
     last: Sending | None = None
 
     def note(sending: Sending) -> None:
@@ -104,10 +121,20 @@ def submitted(client: Client, path: Path, options: RefineOptions, **how: Any) ->
 
     with SendingView() as view:
         try:
-            return client.submit(path, options, on_progress=note, **how)
+            if isinstance(path, Path):
+                return client.submit(path, options, on_progress=note, **how)
+            files = () if how.get("resume") else _files_at(path)
+            name = urlsplit(path).path.rstrip("/").rpartition("/")[2] or urlsplit(path).netloc
+            return client.submit_addresses(files, options, name=name, on_progress=note, **how)
         except KeyboardInterrupt:
             _print_how_to_resume(last, how.get("resume"))
             raise click.exceptions.Exit(exit_codes.SIGINT) from None
+
+
+def _files_at(address: str) -> Sequence[FileAddress]:
+    from biresnerf.client import FileAddress, bucket_files
+
+    return bucket_files(address) if address.startswith("s3://") else (FileAddress(url=address),)
 
 
 def _print_how_to_resume(last: Sending | None, resumed: str | None) -> None:

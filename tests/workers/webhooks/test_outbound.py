@@ -263,3 +263,54 @@ async def test_the_time_limit_covers_everything_and_a_long_body_is_not_read():
             f"http://127.0.0.1:{receiver.port}/", b"", {}, timeout_s=5
         )
         assert (answer.status, answer.retry_after) == (200, "7")
+
+
+async def got(outbound: Outbound, url: str, *, head_s: float = 5.0, idle_s: float = 5.0) -> bytes:
+    headers = {"Accept-Encoding": "identity", "content-length": "0"}  # by which the receiver knows the end
+    async with outbound.get(url, headers, head_s=head_s, idle_s=idle_s) as answer:
+        return b"%d " % answer.status + b"".join([chunk async for chunk in answer.chunks])
+
+
+@pytest.mark.anyio
+async def test_each_redirect_of_a_get_is_judged_like_the_first_address():
+    content = b"HTTP/1.1 200 OK\r\nContent-Length: 3\r\n\r\nabc"
+    async with receiving(Receiver(content)) as receiver:
+        port = receiver.port
+        outbound = Outbound(open_policy(port), resolve=Names(["127.0.0.1"]))
+        assert await got(outbound, f"http://files.example:{port}/a") == b"200 abc"
+        for to, code in [
+            (f"http://inner.example:{port}/", "address_refused"),  # a name of an address inside
+            ("http://169.254.169.254/", "url_refused"),
+            ("http://10.0.0.1/", "url_refused"),
+            (f"gopher://files.example:{port}/", "url_refused"),
+            ("http://[::1/", "url_refused"),
+        ]:
+            receiver.heard.clear()
+            receiver.answer = f"HTTP/1.1 302 F\r\nLocation: {to}\r\nContent-Length: 0\r\n\r\n".encode()
+            outbound = Outbound(open_policy(port), resolve=Names(["127.0.0.1"], ["169.254.169.254"]))
+            with pytest.raises(Refused) as told:
+                await got(outbound, f"http://files.example:{port}/a")
+            assert (told.value.code, len(receiver.heard)) == (code, 1)
+
+
+@pytest.mark.anyio
+async def test_a_get_that_stops_in_its_head_or_body_ends_in_time():
+    head = b"HTTP/1.1 200 OK\r\nContent-Length: 9\r\n\r\n"
+
+    class Stops(Receiver):
+        async def hear(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            await reader.readuntil(b"\r\n\r\n")
+            writer.write(self.answer)
+            await writer.drain()
+            await asyncio.sleep(3)
+            writer.close()
+
+    for answer in (head[:9], head + b"abc"):
+        async with receiving(Stops(answer)) as receiver:
+            with pytest.raises(TimeoutError):
+                await got(
+                    Outbound(open_policy(receiver.port)),
+                    f"http://127.0.0.1:{receiver.port}/",
+                    head_s=0.3,
+                    idle_s=0.3,
+                )

@@ -85,13 +85,16 @@ async def until(holds: Callable[[], bool]) -> None:
 
 
 def hook_settings(database_url: str, tmp_path: Path) -> Settings:
-    """Receivers live on this machine, and are asked again soon."""
+    """Receivers and senders of files live on this machine, and are asked again soon."""
     return quick_settings(
         tmp_path / "data",
         database_url=database_url,
         webhook_http=True,
         webhook_ports=(),
         webhook_networks=("127.0.0.0/8",),
+        file_address_http=True,
+        file_address_ports=(),
+        file_address_networks=("127.0.0.0/8",),
         webhook_retry_s=0.1,
         webhook_timeout_s=1.0,
     )

@@ -97,7 +97,8 @@ CREATE INDEX dataset_imports_dataset ON dataset_imports (dataset_id);
 
 -- Uploads under way. Their bytes lie below `folder` in the file store, which goes to the trash with the row.
 -- `take_token`, `take_until`: who brings a received upload into its dataset, and until when without a sign of life.
--- `brought`: bytes that the dataset has already, and that are counted there.
+-- `brought`: bytes that the dataset has already, and that are counted there. `host`: where a dispatcher fetches them;
+-- until it knows their number, `size` is a byte more than there are.
 CREATE TABLE uploads (
     id text PRIMARY KEY,
     dataset_id text NOT NULL REFERENCES datasets ON DELETE CASCADE,
@@ -105,6 +106,7 @@ CREATE TABLE uploads (
     path text COLLATE "C",
     size bigint NOT NULL CHECK (size >= 0),
     sha256 text,
+    host text,
     state text NOT NULL DEFAULT 'receiving' CHECK (state IN ('receiving', 'received', 'stored', 'rejected')),
     received bigint NOT NULL DEFAULT 0 CHECK (received BETWEEN 0 AND size),
     brought bigint NOT NULL DEFAULT 0 CHECK (brought BETWEEN 0 AND size),
@@ -127,6 +129,21 @@ CREATE TABLE upload_pieces (
     size bigint NOT NULL CHECK (size > 0),
     key text NOT NULL,
     PRIMARY KEY (upload_id, start)
+);
+
+-- Uploads that a dispatcher is to fetch. `url` is a secret: the row goes once all bytes are here, or none will be.
+-- `size`: as announced. `etag`: what the pieces so far are of. `round`: tries in a row that brought little.
+-- `token`, `leased_until`: who fetches it; `losses`: how many were lost who did.
+CREATE TABLE upload_fetches (
+    id text PRIMARY KEY REFERENCES uploads ON DELETE CASCADE,
+    url text NOT NULL,
+    size bigint,
+    etag text,
+    round int NOT NULL DEFAULT 0,
+    due_at timestamptz NOT NULL DEFAULT clock_timestamp(),
+    token uuid,
+    leased_until timestamptz,
+    losses int NOT NULL DEFAULT 0
 );
 
 CREATE FUNCTION bytes_of_artifacts(_artifacts jsonb) RETURNS bigint LANGUAGE sql IMMUTABLE AS $$
