@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 LEAST_CAMERAS = 6
-CONTRADICTED = 3.0  # errors so many times as large as stated are worth a warning
+UNDERSTATED = 3.0  # errors so many times as large as stated are worth a warning
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +69,7 @@ class GivenPoses:
         """Whether errors are far larger than stated."""
         measured = (self.rotation, self.position)
         return any(
-            0 < known * CONTRADICTED < found for known, found in zip(self.stated, measured, strict=True)
+            0 < known * UNDERSTATED < found for known, found in zip(self.stated, measured, strict=True)
         )
 
     def tells(self, prior: PosePrior) -> bool:

@@ -46,7 +46,7 @@ CENTRE_DEVIATION, ASPECT_DEVIATION = 0.01, 0.005
 OF_MODELS = {K1: "k1", K2: "k2", 5: "p1", 6: "p2", ASPECT: "fy"}
 # A given focal length is contradicted if another one is preferred by more than so many standard deviations of what is
 # known before and of what the evidence says together.
-CONTRADICTED = 2.0
+FOCAL_CONTRADICTED = 2.0
 
 
 def lenses_before(dataset: Dataset, option: RefineIntrinsics) -> Lenses:
@@ -143,7 +143,11 @@ def contradicted_focals(
     for i in np.flatnonzero(kept.free[:, 0]).tolist():
         off, deviation = freed.lenses.correction[i, 0], freed.lenses.deviation[i, 0]
         observable = bool(freed.lenses.observable[i, 0])
-        clear = observable and better and abs(off) > CONTRADICTED * np.hypot(kept.deviation[i, 0], deviation)
+        clear = (
+            observable
+            and better
+            and abs(off) > FOCAL_CONTRADICTED * np.hypot(kept.deviation[i, 0], deviation)
+        )
         said[i] = FocalCertainty(_known(deviation), observable, float(np.exp(off)) if clear else None)
     return said
 

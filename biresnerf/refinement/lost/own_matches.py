@@ -22,7 +22,7 @@ LEAST_PAIRS = 8  # of an image's observations with others; fewer say nothing of 
 LEAST_PX = 0.05  # errors below it are equal: features are not that exact
 # Errors of an image beyond so many times the median image's contradict its pose. The largest of any camera of fountain-
 # P11, lego at 200 px, temple, fox and the demo scene, at true poses and at noise of 0.005 and 0.15: 3.6.
-CONTRADICTED = 8.0
+TIMES_USUAL = 8.0
 # Times the median image's error: how near to its feature a point must appear to agree with a pose.
 AGREE = 4.0
 LEAST_PARALLAX_DEG = 1.0  # of points that a camera is placed by
@@ -109,7 +109,7 @@ def _medians(image: NDArray[np.int64], errors: Array, count: int) -> Array:
 
 def contradicted(errors_px: Array) -> NDArray[np.bool_]:
     """Cameras [n] whose own matches fit far worse than the set's, by their errors [n]."""
-    return np.asarray(np.nan_to_num(errors_px) > CONTRADICTED * _usual(errors_px))
+    return np.asarray(np.nan_to_num(errors_px) > TIMES_USUAL * _usual(errors_px))
 
 
 def better(camera: int, before_px: Array, after_px: Array) -> bool:

@@ -14,7 +14,7 @@ from biresnerf.refinement.verdict.judgement import Judgement
 from biresnerf.uncertainty import KnownFrom, PoseUncertainty
 
 FIXED = "they were kept as given, on request"
-CONTRADICTED = "their feature matches contradict them"
+MATCHES_CONTRADICT = "their feature matches contradict them"
 NO_EVIDENCE = "no feature matches or patches support them"
 LOST = "no pose was found that agrees with the photo"
 OPEN = "their matches do not determine them"
@@ -49,7 +49,7 @@ def pose_uncertainty(
     lost = optimiser.camera_errors.lost.tolist()
     reasons = [
         FIXED if optimiser.bodies.fixed[i]
-        else CONTRADICTED if wrong[i]
+        else MATCHES_CONTRADICT if wrong[i]
         else None if found is not None and found.known[i]
         else LOST if lost[i]
         else NO_EVIDENCE if found is None or not (found.by_tracks[i] or found.by_patches[i])

@@ -13,7 +13,7 @@ from biresnerf.refinement.finish.expected_errors import TRACK_MODEL_ERROR
 from biresnerf.refinement.finish.outcome import Finish
 from biresnerf.refinement.start.refined_poses import RefinedPoses
 from biresnerf.refinement.verdict.judgement import judge_poses
-from biresnerf.refinement.verdict.pose_uncertainty import CONTRADICTED, NO_EVIDENCE, pose_uncertainty
+from biresnerf.refinement.verdict.pose_uncertainty import MATCHES_CONTRADICT, NO_EVIDENCE, pose_uncertainty
 from tests.refinement.adjustment.rig import disturbed
 from tests.refinement.finish.test_adjust_cameras import VIEWS, stages
 
@@ -78,4 +78,6 @@ def test_a_pose_that_its_own_matches_contradict_is_not_known(tmp_path, rng):
     errors = judgement.epipolar_px.copy()
     errors[:, 3] = 20 * np.nanmedian(errors)
     known = pose_uncertainty(run, finish, replace(judgement, epipolar_px=errors))
-    assert [each.why_unknown for each in known] == [CONTRADICTED if i == 3 else None for i in range(VIEWS)]
+    assert [each.why_unknown for each in known] == [
+        MATCHES_CONTRADICT if i == 3 else None for i in range(VIEWS)
+    ]
