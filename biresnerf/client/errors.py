@@ -96,7 +96,7 @@ class ServiceError(FaultError):
 
 
 class JobFailed(BiresnerfError):
-    """The job failed, was cancelled or has expired; ``job`` is its final state."""
+    """The job failed, was cancelled, missed its deadline or has expired; ``job`` is its final state."""
 
     def __init__(self, job: JobView) -> None:
         self.job = job
@@ -104,7 +104,8 @@ class JobFailed(BiresnerfError):
         if error is None:
             super().__init__(f"The job {job.id} is {job.state}.")
             return
-        super().__init__(f"The job {job.id} failed ({error.code}): {error}")
+        how = "failed" if job.state == "failed" else f"is {job.state}"
+        super().__init__(f"The job {job.id} {how} ({error.code}): {error}")
 
 
 class JobNotOver(BiresnerfError, TimeoutError):

@@ -7,7 +7,7 @@ import json
 import uuid
 from collections.abc import Mapping, Sequence
 from datetime import datetime
-from typing import Any, TypeAlias, TypedDict, Unpack
+from typing import Any, TypeAlias, Unpack
 
 from biresnerf.client.transport import Call, Transport, parse
 from biresnerf.options.formats import ExportName
@@ -17,35 +17,20 @@ from biresnerf.wire.base import LABEL_LENGTH, LABELS_MOST
 from biresnerf.wire.jobs import (
     CancelJob,
     ForkJob,
+    JobDetails,
     JobList,
     JobState,
     JobView,
     LogLine,
     NewExport,
     NewJob,
-    PriorityName,
     WantedStage,
     job_url,
 )
 from biresnerf.wire.results import ArtifactList, ArtifactView, ImageList, NewShare, ShareView
-from biresnerf.wire.webhooks import JobWebhook
 
 OptionsLike: TypeAlias = RefineOptions | Mapping[str, Any] | None
 _LOG_LINES = 1000
-
-
-class JobDetails(TypedDict, total=False):
-    """What a new job may have beside its input, options and labels.
-
-    Attributes:
-        priority: before or after other jobs.
-        webhook: where messages about it go.
-        fixed_from: a job with a result of some of the photos: they keep its poses and lenses, others join its frame.
-    """
-
-    priority: PriorityName
-    webhook: JobWebhook
-    fixed_from: str
 
 
 class JobCalls(Transport):

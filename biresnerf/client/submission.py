@@ -14,7 +14,6 @@ from biresnerf.client.dataset_calls import DatasetCalls
 from biresnerf.client.errors import ServiceError
 from biresnerf.client.job_calls import (
     JobCalls,
-    JobDetails,
     OptionsLike,
     as_options,
     idempotency_key_of,
@@ -24,7 +23,7 @@ from biresnerf.client.scene import look_at
 from biresnerf.client.transport import tell
 from biresnerf.client.uploads import LocalFile, Uploads
 from biresnerf.wire.datasets import DatasetView, FileAddress
-from biresnerf.wire.jobs import JobView, NewJob
+from biresnerf.wire.jobs import JobDetails, JobView, NewJob
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,7 @@ class Submissions(DatasetCalls, JobCalls, Uploads):
             name: of the dataset, and of the job unless ``labels`` has a ``name``. Default: the folder's.
             resume: the dataset of an interrupted submission.
             on_progress: called at each step, and with the bytes sent.
-            details: `priority`, `webhook`, `fixed_from`: see `JobDetails`.
+            details: see `JobDetails`.
 
         Raises:
             InputError: the folder or the options cannot be used; nothing was sent then.

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Generic, Self, TypeVar
+import re
+from typing import Annotated, Any, Generic, Self, TypeVar
 
-from pydantic import ConfigDict, Field, StringConstraints
+from pydantic import AwareDatetime, BeforeValidator, ConfigDict, Field, StringConstraints
 
 from biresnerf.frozen_model import FrozenModel
 
@@ -42,3 +43,15 @@ NO_CONTROLS = r"^[^\x00-\x1f]*$"  # the database stores no NUL in text
 LABELS_MOST, LABEL_LENGTH = 20, 100
 Label = Annotated[str, StringConstraints(min_length=1, max_length=LABEL_LENGTH, pattern=NO_CONTROLS)]
 Labels = Annotated[dict[Label, Label], Field(max_length=LABELS_MOST)]
+
+
+def _no_number(value: Any) -> Any:
+    """Refuses what pydantic would read as seconds since 1970."""
+    if isinstance(value, int | float) or (
+        isinstance(value, str) and not re.match(r"\d{4}-\d\d-\d\d[T ]", value)
+    ):
+        raise ValueError("a time is written as in 2026-01-31T12:00:00Z")
+    return value
+
+
+Time = Annotated[AwareDatetime, BeforeValidator(_no_number)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypedDict
 from urllib.parse import quote
 
 from pydantic import ConfigDict, Field
@@ -13,13 +13,13 @@ from biresnerf.options.option import ONCE
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.report import VerdictName
 from biresnerf.stages import ReusableStage, Stage
-from biresnerf.wire.base import NO_CONTROLS, Labels, Links, Page, Record
+from biresnerf.wire.base import NO_CONTROLS, Labels, Links, Page, Record, Time
 from biresnerf.wire.datasets import dataset_url
 from biresnerf.wire.problems import JobError
 from biresnerf.wire.webhooks import JobWebhook
 
-JobState = Literal["queued", "running", "succeeded", "failed", "cancelled", "expired"]
-FINAL_JOB_STATES: frozenset[JobState] = frozenset({"succeeded", "failed", "cancelled", "expired"})
+JobState = Literal["queued", "running", "succeeded", "failed", "cancelled", "missed", "expired"]
+FINAL_JOB_STATES: frozenset[JobState] = frozenset({"succeeded", "failed", "cancelled", "missed", "expired"})
 PriorityName = Literal["low", "normal", "high"]
 JobKind = Literal["refine", "export"]
 
@@ -36,9 +36,11 @@ EventType = Literal[
     "succeeded",
     "failed",
     "cancelled",
+    "missed",
     "expired",
 ]
 WantedStage = Literal["auto", "seeding", "coarse"]
+DEADLINE_MOST_S = 30 * 86_400  # the latest deadline, from the submission
 
 
 class JobProgress(Record):
@@ -110,6 +112,12 @@ class JobView(Record):
     attempt: int = Field(0, examples=[1])
     cancel_requested: bool = False
     created_at: datetime
+    start_by: datetime | None = Field(
+        None, description="If it has not started by then, it ends as `missed`; null if it may wait."
+    )
+    deadline_at: datetime | None = Field(
+        None, description="If it runs then, it is stopped, and keeps its best poses so far."
+    )
     started_at: datetime | None = None
     finished_at: datetime | None = None
     expires_at: datetime | None = Field(
@@ -190,6 +198,35 @@ class JobTexts(Record):
     priority: PriorityName = Field(
         "normal", description="Before or after other jobs; `high` only where the operator allows it."
     )
+    expires_in_queue_s: int | None = Field(
+        None,
+        ge=1,
+        le=DEADLINE_MOST_S,
+        description="Seconds from the submission. If the job has not started by then, it ends as `missed`.",
+    )
+    deadline_at: Time | None = Field(
+        None,
+        description="A time with an offset, at most 30 days ahead. If the job has not started by then, it ends as "
+        "`missed`; if it has, it is stopped, and keeps its best poses so far.",
+    )
+
+
+class JobDetails(TypedDict, total=False):
+    """What a new job may have beside its input, options and labels.
+
+    Attributes:
+        priority: before or after other jobs.
+        webhook: where messages about it go.
+        fixed_from: a job with a result of some of the photos: they keep its poses and lenses, others join its frame.
+        expires_in_queue_s: seconds from the submission, after which it is not started any more.
+        deadline_at: when it is stopped, with its best poses so far.
+    """
+
+    priority: PriorityName
+    webhook: JobWebhook | None
+    fixed_from: str | None
+    expires_in_queue_s: int | None
+    deadline_at: datetime | None
 
 
 class NewJob(JobTexts):

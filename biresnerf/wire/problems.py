@@ -34,7 +34,7 @@ class JobError(Fault):
     """Why a job, an upload or the check of a dataset failed.
 
     ``code`` is one of the library's (InputError, RefinementError) or of the engine's: ``timeout``,
-    ``out_of_memory``, ``too_many_crashes``, ``engine_error``.
+    ``out_of_memory``, ``too_many_crashes``, ``deadline_passed``, ``engine_error``.
     """
 
     retryable: bool = False

@@ -14,7 +14,13 @@ from pydantic import AfterValidator, ConfigDict, Field, StringConstraints
 from biresnerf.wire.base import NO_CONTROLS, Links, Page, Record
 
 WebhookEvent = Literal[
-    "job.queued", "job.started", "job.succeeded", "job.failed", "job.cancelled", "dataset.validated"
+    "job.queued",
+    "job.started",
+    "job.succeeded",
+    "job.failed",
+    "job.cancelled",
+    "job.missed",
+    "dataset.validated",
 ]
 ALL_EVENTS: tuple[WebhookEvent, ...] = get_args(WebhookEvent)
 DeliveryState = Literal["pending", "delivered", "failed"]
@@ -128,7 +134,9 @@ class JobWebhook(Record):
         examples=["whsec_MfKQ9r8GKYqrTwjUPD8ILPZIo2LaLaSw"],
     )
     events: tuple[WebhookEvent, ...] = Field(
-        ("job.succeeded", "job.failed", "job.cancelled"), min_length=1, max_length=len(ALL_EVENTS)
+        ("job.succeeded", "job.failed", "job.cancelled", "job.missed"),
+        min_length=1,
+        max_length=len(ALL_EVENTS),
     )
 
 

@@ -69,6 +69,7 @@ CATALOGUE: dict[str, tuple[int, str]] = {
     "address_refused": (422, "Files at this address are not fetched"),
     "fetch_failed": (422, "The file could not be fetched"),
     "webhook_url_refused": (422, "Webhooks to this address are not allowed"),
+    "deadline_refused": (422, "The deadline has passed or is too far ahead"),
     "digest_mismatch": (422, "The digest of the bytes is not the announced one"),
     "dataset_invalid": (422, "The images and poses cannot be used"),
     "validation_timeout": (422, "Checking the files took too long"),

@@ -37,7 +37,7 @@ _FORM: dict[str, Any] = {
         },
     },
     "encoding": {
-        name: {"contentType": "text/plain" if name == PLAIN else "application/json"} for name in TEXTS
+        name: {"contentType": "text/plain" if name in PLAIN else "application/json"} for name in TEXTS
     },
 }
 _BODY = {
@@ -58,6 +58,7 @@ _DISCARD = CancelJob()
         *("bad_idempotency_key", "not_found", "dataset_not_ready", "invalid_options"),
         *("idempotency_key_reused", "archive_rejected", "queue_full", "storage_full", "too_many_uploads"),
         *("webhook_url_refused", "priority_not_allowed", "quota_exhausted", "daily_limit_reached"),
+        "deadline_refused",
         *("result_not_ready", "state_conflict", "expired"),
     )
     | {200: {"model": JobView, "description": "The job has ended; only with `Prefer: wait`."}},
@@ -81,15 +82,7 @@ async def submit_job(
     elif kind == "application/json":
         async with read_json(request) as values:
             body = validate(values, NewJob)
-        job, new = await caller.jobs.submit(
-            body.dataset_id,
-            body.options,
-            labels=body.labels,
-            idempotency_key=idempotency_key,
-            webhook=body.webhook,
-            priority=body.priority,
-            fixed_from=body.fixed_from,
-        )
+        job, new = await caller.jobs.submit(**dict(body), idempotency_key=idempotency_key)
     else:
         raise ProblemError(
             "unsupported_media",

@@ -16,17 +16,16 @@ from service.intake.dataset_finalize import begin_check, finish_check
 from service.intake.json_body import load_json, validate
 from service.intake.uploads import Form, limited_body, staging_folder
 from workers.settings.errors import EngineError
-from workers.webhooks.webhooks import request_with
 
 # For the text fields and the delimiters of the form.
 _FORM_BYTES = 2**20
 TEXTS = tuple(JobTexts.model_fields)
 # Plain text; the other text fields are JSON.
-PLAIN = "priority"
+PLAIN = ("priority", "deadline_at")
 
 
 async def submit_form(caller: Caller, request: Request, idempotency_key: str | None) -> tuple[JobView, bool]:
-    """Submits the form: `archive`, `options`, `labels` and `webhook` as JSON, `priority` as plain text.
+    """Submits the form: `archive`, and the texts as JSON but for those of `PLAIN`.
 
     Returns the job and whether it is new. A repeated request with the same key is recognised by the archive's digest,
     before anything is unpacked. If the job cannot be submitted, its dataset is deleted. Needs the scope
@@ -50,10 +49,7 @@ async def _submit_received(
     texts = _texts(form)
     digest = await asyncio.to_thread(file_sha256, archive)
     if idempotency_key is not None:
-        subject = request_with(digest, texts.webhook)
-        known = await caller.jobs.repeated(
-            subject, texts.options, texts.labels, idempotency_key, texts.priority
-        )
+        known = await caller.jobs.repeated(digest, texts, idempotency_key)
         if known is not None:
             return known, False
     datasets = caller.datasets
@@ -64,13 +60,7 @@ async def _submit_received(
         await begin_check(caller, dataset.id)
         await finish_check(caller, dataset.id)
         job, used = await caller.jobs.submit(
-            dataset.id,
-            texts.options,
-            labels=texts.labels,
-            idempotency_key=idempotency_key,
-            request_digest=digest,
-            webhook=texts.webhook,
-            priority=texts.priority,
+            dataset.id, **dict(texts), idempotency_key=idempotency_key, request_digest=digest
         )
         return job, used
     finally:
@@ -81,5 +71,5 @@ async def _submit_received(
 
 def _texts(form: Form) -> JobTexts:
     given = {name: text.strip() for name, text in form.texts.items() if text.strip()}
-    values = {name: text if name == PLAIN else load_json(text) for name, text in given.items()}
+    values = {name: text if name in PLAIN else load_json(text) for name, text in given.items()}
     return validate(values, JobTexts)

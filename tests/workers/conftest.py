@@ -23,7 +23,7 @@ from psycopg import sql
 from psycopg.conninfo import make_conninfo
 
 from biresnerf.options.refine_options import RefineOptions
-from biresnerf.wire.jobs import JobKind, JobView
+from biresnerf.wire.jobs import JobDetails, JobKind, JobView
 from workers.database import job_queue
 from workers.database.database import Database
 from workers.database.embedded_postgres import EmbeddedPostgres
@@ -225,10 +225,12 @@ class Counting:
         self.stores, self._journal = stores, journal
         self.id = ""
 
-    async def submit(self, steps: int, step_s: float, **faults: object) -> str:
+    async def submit(
+        self, steps: int, step_s: float, *, details: JobDetails | None = None, **faults: object
+    ) -> str:
         plan = {"steps": steps, "step_s": step_s, "journal": str(self._journal), **faults}
         dataset_id = await ready_dataset(self.stores, {"plan.json": json.dumps(plan).encode()})
-        job, _ = await self.stores.jobs.submit(dataset_id, RefineOptions(preset="fast"))
+        job, _ = await self.stores.jobs.submit(dataset_id, RefineOptions(preset="fast"), **(details or {}))
         self.id = job.id
         return job.id
 

@@ -10,6 +10,7 @@ from biresnerf.stages import ReusableStage
 from biresnerf.wire.jobs import JobKind
 from workers.database import job_queue
 from workers.database.database import Database
+from workers.jobs.deadlines import OVERDUE, end_overdue
 from workers.jobs.job_states import finish, finish_cancelled, start_attempt, trash_attempts
 from workers.jobs.setbacks import crashed_too_often, used_up
 from workers.process.waiting import retry_while_unavailable
@@ -53,7 +54,8 @@ async def claim_job(
     """Claim a job with a fresh token, for the worker that has its queue entry; none where there is nothing to run.
 
     A worker that was taken for dead and woke up finds the entry in the queue again, or with another worker.
-    A job whose cancellation was asked for ends ``cancelled``, one that has used up its attempts ends ``failed``.
+    A job whose cancellation was asked for ends ``cancelled``, one that has used up its attempts ends ``failed``, one
+    beyond its time as `end_overdue` says.
     """
     token = uuid.uuid4()
     return await retry_while_unavailable(
@@ -65,7 +67,8 @@ async def _claim(
     database: Database, job_id: str, worker_id: int, max_attempts: int, stall_s: float, token: uuid.UUID
 ) -> Claim | None:
     async with database.transaction() as connection:
-        row = await connection.row("SELECT * FROM jobs WHERE id = %s FOR UPDATE", job_id)
+        sql = f"SELECT *, {OVERDUE} AS overdue FROM jobs WHERE id = %s FOR UPDATE"
+        row = await connection.row(sql, job_id)
         if row is not None and row["run_token"] == token:
             # An earlier try got through, though its acknowledgement was lost: the attempt counts once.
             return _claimed(row, token)
@@ -75,8 +78,12 @@ async def _claim(
             return None
         if row["state"] == "running":  # the end of its last attempt was never written
             await connection.execute("UPDATE jobs SET run_token = NULL WHERE id = %s", (job_id,))
-        if row["cancel_requested"]:
+        if row["overdue"] and not row["cancel_requested"]:
+            await end_overdue(connection, row, stall_s)
+        # Nobody runs it, though the row may say so.
+        if row["cancel_requested"] or (row["overdue"] and row["state"] == "running"):
             await finish_cancelled(connection, job_id, stall_s)
+        if row["cancel_requested"] or row["overdue"]:
             return None
         if used_up(row["attempt"], row["crashes"], row["losses"], max_attempts):
             await finish(connection, job_id, "failed", crashed_too_often(row["attempt"], row["setback"]))

@@ -122,7 +122,7 @@ class DerivedJobs(JobStore):
         `LimitReached` (``queue_full``).
         """
         options = {"formats": sorted(set(formats))}
-        fingerprint = fingerprint_of(f"export {job_id}", options, None)
+        fingerprint = fingerprint_of(f"export {job_id}", options)
         async with self._database.transaction() as connection:
             parent = await self._required(connection, job_id)
             require_result(parent)

@@ -52,7 +52,7 @@ async def expire_jobs(connection: Connection, limit: int) -> int:
     """Expire the results that are due, at most ``limit``; returns how many."""
     due = await connection.rows(
         "SELECT id, tenant, finished_at, artifacts FROM jobs WHERE expires_at <= now()"
-        " AND state IN ('succeeded', 'failed', 'cancelled')"
+        " AND state IN ('succeeded', 'failed', 'cancelled', 'missed')"
         # An unfinished export, fork or job that joins it still reads the files.
         " AND NOT EXISTS (SELECT 1 FROM jobs AS export WHERE export.parent = jobs.id"
         " AND export.state IN ('queued', 'running'))"

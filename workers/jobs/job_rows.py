@@ -10,7 +10,7 @@ from typing import Any
 from psycopg.types.json import Jsonb
 
 from biresnerf.options.refine_options import RefineOptions
-from biresnerf.wire.jobs import JobEvent, JobProgress, JobUse, JobView, PriorityName
+from biresnerf.wire.jobs import JobEvent, JobProgress, JobTexts, JobUse, JobView
 from workers.database.database import Connection
 from workers.records import PREVIEW_FOLDER, THUMBNAIL_NAME, priority_name, record_from_row
 from workers.settings.errors import Conflict, Expired
@@ -51,7 +51,7 @@ def require_result(row: Mapping[str, Any]) -> None:
         raise Conflict("result_not_ready", f"The job is {row['state']}.")
     names = {item["name"] for item in row["artifacts"]}
     if not names.issuperset(WHOLE_RESULT):
-        raise Conflict("state_conflict", f"The job {row['state']} without a whole set of poses.")
+        raise Conflict("state_conflict", f"The job ended as {row['state']}, without a whole set of poses.")
 
 
 def _thumbnail(row: dict[str, Any]) -> str | None:
@@ -77,16 +77,17 @@ async def jobs_of_dataset(connection: Connection, dataset_id: str) -> list[str]:
     return [f"{job['id']} ({job['state']})" for job in jobs]
 
 
-def fingerprint_of(
-    subject: str,
-    options: dict[str, Any],
-    labels: Mapping[str, str] | None,
-    priority: PriorityName = "normal",
-) -> str:
+def fingerprint_of(subject: str, options: Mapping[str, Any], labels: Mapping[str, str] | None = None) -> str:
     """A digest of a request: two requests with one idempotency key are the same where these are equal."""
-    parts = [subject, options, dict(labels or {}), *([priority] if priority != "normal" else [])]
-    request = json.dumps(parts, sort_keys=True)
+    request = json.dumps([subject, dict(options), dict(labels or {})], sort_keys=True)
     return hashlib.sha256(request.encode()).hexdigest()
+
+
+def submission_fingerprint(subject: str, asked: JobTexts) -> str:
+    """That of a submission, whose input is ``subject``: the dataset, or the digest of what was sent."""
+    return fingerprint_of(
+        subject, asked.model_dump(mode="json", exclude_defaults=True, exclude={"dataset_id"})
+    )
 
 
 async def known_job(

@@ -26,7 +26,7 @@ from workers.store.trash import discard
 
 log = logging.getLogger(__name__)
 
-End = Literal["succeeded", "failed", "cancelled"]
+End = Literal["succeeded", "failed", "cancelled", "missed"]
 
 
 async def add_event(
@@ -180,16 +180,22 @@ async def offer_held_jobs(connection: Connection) -> None:
 
 
 async def request_cancel(
-    connection: Connection, job_id: str, tenant: str | None, keep_partial: bool, stall_s: float
+    connection: Connection,
+    job_id: str,
+    tenant: str | None,
+    keep_partial: bool,
+    stall_s: float,
+    why: JobError | None = None,
 ) -> None:
-    """Cancel a queued job, or ask its worker to. Does nothing where that was requested before, or the job is over."""
+    """Cancel a queued job, or ask its worker to. Does nothing where that was requested before, or the job is over.
+
+    ``why`` becomes its error; none where its user asks.
+    """
     job = await connection.row(
-        "UPDATE jobs SET cancel_requested = true, keep_partial = %s"
+        "UPDATE jobs SET cancel_requested = true, keep_partial = %s, error = %s"
         " WHERE id = %s AND tenant = coalesce(%s, tenant) AND state IN ('queued', 'running')"
         " AND NOT cancel_requested RETURNING queue_id, state",
-        keep_partial,
-        job_id,
-        tenant,
+        *(keep_partial, _error_column(why), job_id, tenant),
     )
     if job is None:
         return
@@ -197,7 +203,7 @@ async def request_cancel(
     if job["state"] == "queued":  # perhaps after an attempt that has shown something
         await finish_cancelled(connection, job_id, stall_s)
     else:
-        await add_event(connection, job_id, "cancel_requested")
+        await add_event(connection, job_id, "cancel_requested", {"code": why.code} if why else {})
 
 
 async def delete_job(connection: Connection, job_id: str) -> None:
@@ -221,14 +227,18 @@ async def finish(
         " eta_s = NULL, fraction = CASE WHEN %s = 'succeeded' THEN 1 ELSE fraction END,"
         " partial = %s, previews = NULL, checkpoint = NULL WHERE id = %s",
         (
-            *(state, Jsonb(error.model_dump()) if error else None),
+            *(state, _error_column(error)),
             *(Jsonb([item.model_dump() for item in artifacts]), state, partial, job_id),
         ),
     )
     data: dict[str, Any] = {"code": error.code, "detail": error.detail} if error else {}
     if state == "cancelled":
-        data = {"partial": partial}
+        data["partial"] = partial
     await add_event(connection, job_id, state, data)
+
+
+def _error_column(error: JobError | None) -> Jsonb | None:
+    return Jsonb(error.model_dump()) if error else None
 
 
 async def finish_cancelled(
@@ -238,7 +248,7 @@ async def finish_cancelled(
     artifacts: Sequence[Artifact] = (),
     keep: str | None = None,
 ) -> None:
-    """End a job on request, with the files that its user wants: all there are, or the log alone.
+    """End a job on request, or at its deadline, with the files that are wanted: all there are, or the log alone.
 
     Where a partial result is wanted and the process did not come to write one, the last preview is it.
 
@@ -247,7 +257,7 @@ async def finish_cancelled(
         artifacts: what the attempt could store.
         keep: the attempt's name.
     """
-    row = await connection.only_row("SELECT keep_partial, previews FROM jobs WHERE id = %s", job_id)
+    row = await connection.only_row("SELECT keep_partial, previews, error FROM jobs WHERE id = %s", job_id)
     logs = [item for item in artifacts if item.name == LOG_NAME]
     kept, shown = list(artifacts), None
     if row["keep_partial"] and not _is_whole(kept) and row["previews"] is not None:
@@ -257,7 +267,8 @@ async def finish_cancelled(
             for item in map(Artifact.model_validate, row["previews"]["artifacts"])
         ]
     partial = row["keep_partial"] and _is_whole(kept)
-    await finish(connection, job_id, "cancelled", None, kept if partial else logs, partial=partial)
+    why = JobError.model_validate(row["error"]) if row["error"] else None
+    await finish(connection, job_id, "cancelled", why, kept if partial else logs, partial=partial)
     await trash_attempts(connection, job_id, stall_s, keep, preview=shown)
 
 

@@ -6,26 +6,26 @@ import asyncio
 import contextlib
 from collections.abc import AsyncGenerator, Mapping
 from datetime import datetime
-from typing import Any, Self
+from typing import Any, Self, Unpack
 
 from psycopg.types.json import Jsonb
 
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.wire.base import Page
-from biresnerf.wire.jobs import JobEvent, JobState, JobView, LogLine, PriorityName
-from biresnerf.wire.webhooks import JobWebhook
+from biresnerf.wire.jobs import JobDetails, JobEvent, JobState, JobTexts, JobView, LogLine, NewJob
 from workers.database.database import Connection, Database, OwnedStore
 from workers.database.ids import new_id
+from workers.jobs.deadlines import limit_columns
 from workers.jobs.job_rows import (
     JOB,
     MINE,
     PLACES,
     asked_columns,
     events_of,
-    fingerprint_of,
     job_from_row,
     known_job,
     require_result,
+    submission_fingerprint,
 )
 from workers.jobs.job_states import delete_job, insert_job, queue_job, request_cancel
 from workers.jobs.job_updates import JobListener, follow
@@ -43,7 +43,7 @@ from workers.settings.errors import Conflict, Expired
 from workers.settings.settings import Settings
 from workers.settings.traces import traced
 from workers.tenants.tenants import LOCAL_TENANT
-from workers.webhooks.webhooks import add_job_webhook, request_with
+from workers.webhooks.webhooks import add_job_webhook
 
 
 class JobStore(OwnedStore):
@@ -72,65 +72,66 @@ class JobStore(OwnedStore):
         labels: Mapping[str, str] | None = None,
         idempotency_key: str | None = None,
         request_digest: str | None = None,
-        webhook: JobWebhook | None = None,
-        priority: PriorityName = "normal",
-        fixed_from: str | None = None,
+        **details: Unpack[JobDetails],
     ) -> tuple[JobView, bool]:
         """Queue a job at its tenant's turn; the job and its queue entry are written in one transaction.
 
         ``request_digest`` stands for the dataset when requests are compared, where the client sent the
         files themselves and the dataset was made for them (see `repeated`).
         Returns the job and whether it is new (False: the same key with the same request came before).
-        ``fixed_from`` is a job whose poses and lenses stay, of photos that both have.
         Raises `NotFound` (dataset, job), `Conflict` (``dataset_not_ready``, ``idempotency_key_reused``,
         ``priority_not_allowed``, a code of `require_result`), `LimitReached` (``queue_full``, ``quota_exhausted``,
-        ``daily_limit_reached``), `InputError` (``webhook_url_refused``).
+        ``daily_limit_reached``), `InputError` (``invalid_options``, ``webhook_url_refused``, ``deadline_refused``).
         """
-        asked = asked_columns(options)
-        subject = request_with(request_digest or dataset_id, webhook)
-        subject += "" if fixed_from is None else f" fixed from {fixed_from}"
-        fingerprint = fingerprint_of(subject, options.model_dump(mode="json"), labels, priority)
+        asked = NewJob(dataset_id=dataset_id, options=options, labels=dict(labels or {}), **details)
+        columns = asked_columns(options)
+        fingerprint = submission_fingerprint(request_digest or dataset_id, asked)
         async with self._database.transaction() as connection:
             tenant = await submitting_for(connection, dataset_id, self._tenant)
             if idempotency_key is not None:
                 known = await known_job(connection, tenant, idempotency_key, fingerprint)
                 if known is not None:
                     return known, False
-            if fixed_from is not None:
-                require_result(await self._required(connection, fixed_from))
-            await require_room(connection, dataset_id, PRIORITIES[priority], self._settings.max_queued)
-            job_id = new_id("job")
-            values = {
-                "id": job_id,
-                "dataset_id": dataset_id,
-                "tenant": tenant,
-                "key_id": self._key_id,
-                "priority": PRIORITIES[priority],
-                "fixed_from": fixed_from,
-                **asked,
-                "labels": Jsonb(dict(labels or {})),
-                "idempotency_key": idempotency_key,
-                "fingerprint": fingerprint,
-            }
-            added = await insert_job(connection, values)
-            if webhook is not None:
-                await add_job_webhook(connection, self._settings, tenant, job_id, webhook)
-            await queue_job(connection, added)  # an event that the webhook is to get
+            columns |= {"tenant": tenant, "idempotency_key": idempotency_key, "fingerprint": fingerprint}
+            job_id = await self._add(connection, asked, columns)
             return job_from_row(await self._required(connection, job_id)), True
+
+    async def _add(self, connection: Connection, asked: NewJob, columns: Mapping[str, Any]) -> str:
+        """The id of a new job in the queue, with these further columns; see `submit`."""
+        if asked.fixed_from is not None:
+            require_result(await self._required(connection, asked.fixed_from))
+        priority = PRIORITIES[asked.priority]
+        await require_room(connection, asked.dataset_id, priority, self._settings.max_queued)
+        job_id = new_id("job")
+        added = await insert_job(
+            connection,
+            {
+                "id": job_id,
+                "dataset_id": asked.dataset_id,
+                "priority": priority,
+                "fixed_from": asked.fixed_from,
+                "key_id": self._key_id,
+                "labels": Jsonb(asked.labels),
+                **await limit_columns(connection, asked),
+                **columns,
+            },
+        )
+        if asked.webhook is not None:
+            await add_job_webhook(connection, self._settings, columns["tenant"], job_id, asked.webhook)
+        await queue_job(connection, added)  # an event that the webhook is to get
+        return job_id
 
     async def repeated(
         self,
         request_digest: str,
-        options: RefineOptions,
-        labels: Mapping[str, str],
+        asked: JobTexts,
         idempotency_key: str,
-        priority: PriorityName = "normal",
     ) -> JobView | None:
         """The job of an earlier request with this key, before anything is done for this one.
 
         Raises `Conflict` (``idempotency_key_reused``) where the earlier request was a different one.
         """
-        fingerprint = fingerprint_of(request_digest, options.model_dump(mode="json"), labels, priority)
+        fingerprint = submission_fingerprint(request_digest, asked)
         async with self._database.transaction() as connection:
             return await known_job(connection, self._tenant or LOCAL_TENANT, idempotency_key, fingerprint)
 

@@ -1,4 +1,4 @@
-"""Puts jobs of dead workers back into the queue, and takes the trash out.
+"""Puts jobs of dead workers back into the queue, ends those beyond their time, and takes the trash out.
 
 Everything about one job happens in one transaction, job row locked first, so two janitors and a cancelling
 client cannot undo each other's work.
@@ -15,6 +15,7 @@ from functools import partial
 from workers.database import job_queue
 from workers.database.database import Connection, Database
 from workers.database.statistics import fold_tallies, fold_use
+from workers.jobs.deadlines import end_overdue_jobs
 from workers.jobs.job_expiry import drop_left_checkpoints
 from workers.jobs.job_states import offer_held_jobs, requeue_lost, take_back
 from workers.settings.errors import Unavailable
@@ -72,6 +73,7 @@ class Janitor:
                 if self._silent_workers_are_dead(row["database_age_s"]):
                     await self._release_stalled(connection)
                 await requeue_lost(connection, self._settings.stall_s)
+                await end_overdue_jobs(connection, self._settings.stall_s)
                 await offer_held_jobs(connection)
                 await fold_tallies(connection)
                 await forget_full_buckets(connection)

@@ -240,8 +240,3 @@ def _delivery_record(row: dict[str, Any]) -> DeliveryView:
     return record_from_row(
         DeliveryView, row, next_attempt_at=row["due_at"] if waits else None, attempts=row["log"]
     )
-
-
-def request_with(subject: str, webhook: JobWebhook | None) -> str:
-    """What a request for a job is about, for its comparison with another one of the same Idempotency-Key."""
-    return subject if webhook is None else f"{subject} {webhook.model_dump_json()}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Sequence
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
@@ -18,6 +19,7 @@ from biresnerf.commands.jobs.follow_job import follow_options, see_through
 from biresnerf.commands.jobs.job_progress import SendingView
 from biresnerf.commands.jobs.service_options import service_at, service_options
 from biresnerf.commands.settings_option import budget_option, settings_option
+from biresnerf.wire.jobs import DEADLINE_MOST_S
 
 if TYPE_CHECKING:
     from biresnerf.client import Client, FileAddress, Sending
@@ -33,6 +35,13 @@ def _labels(_context: click.Context, _parameter: click.Parameter, texts: tuple[s
             raise click.BadParameter(f"{text!r} is not NAME=VALUE")
         labels[name] = value
     return labels
+
+
+def _time(_context: click.Context, _parameter: click.Parameter, text: str | None) -> datetime | None:
+    try:
+        return None if text is None else datetime.fromisoformat(text).astimezone()
+    except ValueError:
+        raise click.BadParameter(f"{text!r} is not a time such as 2026-01-31T18:30") from None
 
 
 label_option = click.option(
@@ -64,6 +73,21 @@ class _SetParameter(click.ParamType):
     "--priority", type=click.Choice(["low", "normal", "high"]), default="normal", show_default=True,
     help="Jobs of higher priority run first; your tenant may have a lower limit.",
 )  # fmt: skip
+@click.option(
+    "--expires-in-queue",
+    "expires_in_queue_s",
+    type=click.IntRange(1, DEADLINE_MOST_S),
+    metavar="SECONDS",
+    help="End the job as missed if it has not started after this time.",
+)
+@click.option(
+    "--deadline",
+    "deadline_at",
+    callback=_time,
+    metavar="TIME",
+    help="Stop the job then, with its best poses so far; as missed if it has not started. Local time, unless it says "
+    "otherwise.",
+)
 @label_option
 @click.option(
     "--fixed-from",

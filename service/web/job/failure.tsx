@@ -7,7 +7,7 @@ export function Failure({ job, images }: { job: JobView; images: readonly string
   const { error } = job;
   if (job.partial && job.state !== "expired") return null; // the verdict says so
   const gone = WITHOUT_RESULT[job.state];
-  if (gone) {
+  if (gone && (!error || job.state === "expired")) {
     return (
       <section class="card">
         <h2>{gone.title}</h2>
@@ -53,6 +53,7 @@ const HEADINGS: Record<string, string> = {
   timeout: "The job took longer than the service allows",
   out_of_memory: "The job ran out of memory",
   too_many_crashes: "The job crashed repeatedly",
+  deadline_passed: "The job's deadline passed",
   engine_error: "The service has an internal error",
   diverged: "The optimisation diverged",
 };

@@ -56,6 +56,7 @@ function Head({ job, seen }: { job: JobView; seen: LiveState }) {
         <Actions job={job} />
       </div>
       <ProgressBar job={job} />
+      {!isOver(job) && job.deadline_at && <p class="soft">It is stopped at {moment(job.deadline_at)}, with the best poses so far.</p>}
       {!isOver(job) && <LiveNumbers job={job} connected={seen.connected} />}
       {!shared.value && job.expires_at && job.state !== "expired" && <p class="soft">Its files are kept until {moment(job.expires_at)}.</p>}
     </header>

@@ -30,6 +30,7 @@ export const STATE_WORDS = {
   succeeded: "done",
   failed: "failed",
   cancelled: "cancelled",
+  missed: "missed",
   expired: "expired",
 } as const;
 

@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from datetime import datetime, timedelta
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -110,6 +111,25 @@ def test_what_the_user_can_fix_is_exit_2(
     assert (done.returncode, done.stdout) == (2, "")
     assert said in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_a_job_is_sent_with_its_limits_of_time(http: httpx.Client, service: Running, scene: Path) -> None:
+    local = (datetime.now() + timedelta(days=2)).isoformat(timespec="minutes")
+    done = submit(service, scene, *FAST, "--deadline", local, "--expires-in-queue", "86400", "--json")
+    assert done.returncode == 0, done.stderr
+    job = json.loads(done.stdout)
+    assert datetime.fromisoformat(job["deadline_at"]) == datetime.fromisoformat(local).astimezone()
+    waits = datetime.fromisoformat(job["start_by"]) - datetime.fromisoformat(job["created_at"])
+    assert abs(waits.total_seconds() - 86_400) < 1
+    finished(http, job["id"])
+    for wrong in (
+        ("--deadline", "tomorrow"),
+        ("--deadline", "2026-01-31T18:30"),
+        ("--expires-in-queue", "0"),
+    ):
+        refused = submit(service, scene, *FAST, *wrong)
+        assert refused.returncode == 2, refused.stderr
+        assert wrong[0] in refused.stderr or "deadline_refused" in refused.stderr
 
 
 def test_a_bad_scene_is_exit_2_and_leaves_no_dataset(

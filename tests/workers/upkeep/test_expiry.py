@@ -15,6 +15,7 @@ from biresnerf.options.refine_options import RefineOptions
 from tests.workers.conftest import ready_dataset
 from workers.database.database import open_database
 from workers.engine import Stores
+from workers.jobs.deadlines import end_overdue_jobs
 from workers.jobs.quotas import submitting_for
 from workers.settings.errors import Conflict, Expired, NotFound
 from workers.settings.settings import Settings
@@ -241,6 +242,27 @@ async def test_records_of_what_expired_go_in_the_end(stores: Stores, settings: S
         await stores.jobs.get(job_id)
     with pytest.raises(NotFound):
         await stores.datasets.get(dataset_id)
+
+
+async def test_a_job_that_missed_its_deadline_goes_as_others_do(stores: Stores, settings: Settings):
+    dataset_id = await ready_dataset(stores, PLAN)
+    job, _ = await stores.jobs.submit(dataset_id, RefineOptions(preset="fast"), expires_in_queue_s=1)
+    with psycopg.connect(settings.require_database_url()) as connection:
+        connection.execute("UPDATE jobs SET start_by = now() - interval '1 hour'")
+    await stores.jobs._database.run(end_overdue_jobs, stall_s=2.0)
+    await rounds(settings, stores)
+    kept = await stores.jobs.get(job.id)
+    assert kept.state == "missed"
+    assert kept.expires_at is not None
+    aged(settings, "jobs", job.id, 8)
+    await rounds(settings, stores)
+    gone = await stores.jobs.get(job.id)
+    assert (gone.state, gone.error) == ("expired", kept.error)
+    with psycopg.connect(settings.require_database_url()) as connection:
+        connection.execute("UPDATE jobs SET expires_at = expires_at - interval '90 days'")
+    await rounds(settings, stores)
+    with pytest.raises(NotFound):
+        await stores.jobs.get(job.id)
 
 
 async def test_two_dispatchers_expire_each_thing_once(stores: Stores, settings: Settings, tmp_path: Path):

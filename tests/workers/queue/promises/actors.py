@@ -16,6 +16,7 @@ from workers.database.database import Connection, Database
 from workers.database.job_queue import Entry
 from workers.database.statistics import fold_tallies
 from workers.jobs.claim import Claim, Fenced, claim_job
+from workers.jobs.deadlines import end_overdue_jobs
 from workers.jobs.job_states import Requeue, offer_held_jobs, requeue_lost
 from workers.jobs.jobs import JobStore
 from workers.jobs.ledger import Ledger
@@ -86,6 +87,9 @@ class Actors:
                 yield from self.next_of(worker, world)
         for _ in range(12 if world.silent else 0):
             yield Act("janitor: release silent workers", self._release, lambda _: model.released)
+        late = any(job.late and not job.final for job in world.jobs.values())
+        for _ in range(6 if late else 1):
+            yield Act("janitor: end what is late", self._end_late, model.late_ones_ended)
         yield Act("janitor: offer and fold", self._upkeep, lambda _: model.unchanged)
 
     def next_of(self, worker: Worker, world: World) -> Iterator[Act]:
@@ -261,6 +265,18 @@ class Actors:
 
     async def _release(self) -> None:
         await retry_while_unavailable(lambda: self._database.run(self._janitor._release_stalled))
+
+    async def _end_late(self) -> frozenset[str] | None:
+        """Which it ended; none where an answer was lost."""
+        tries: list[list[str]] = []
+
+        async def once() -> None:
+            tries.append([])
+            tries[-1] += await self._database.run(end_overdue_jobs, self._settings.stall_s)
+
+        await retry_while_unavailable(once)
+        ended = frozenset(name for name, job_id in self.ids.items() if job_id in tries[-1])
+        return ended if len(tries) == 1 else None
 
     async def _upkeep(self) -> None:
         async def upkeep(connection: Connection) -> None:

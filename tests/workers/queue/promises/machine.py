@@ -45,6 +45,10 @@ DUE = (
     "UPDATE procrastinate_jobs SET scheduled_at = now() - interval '1 second'"
     " WHERE status = 'todo' AND scheduled_at BETWEEN now() AND now() + interval '1 day'"
 )
+LATE = (
+    "UPDATE jobs SET start_by = now() - interval '1 second', deadline_at = now() - interval '1 second'"
+    " WHERE idempotency_key = %s"
+)
 
 
 class Promises(RuleBasedStateMachine):
@@ -63,6 +67,7 @@ class Promises(RuleBasedStateMachine):
         self.world = World()
         self.accepted: set[str] = set()
         self.confirmed: dict[str, int] = {}
+        self.late: dict[str, int] = {}
         self.count("examples")
 
     def count(self, what: str) -> None:
@@ -183,6 +188,19 @@ class Promises(RuleBasedStateMachine):
         }
         self.world = replace(self.world, jobs=due)
 
+    @precondition(lambda self: any(not (job.final or job.late) for job in self.world.jobs.values()))
+    @rule(data=strategies.data())
+    def deadline_passes(self, data: strategies.DataObject) -> None:
+        """Of one job: from here on it does not start."""
+        going_on = [name for name, job in self.world.jobs.items() if not (job.final or job.late)]
+        self.make_late(data.draw(strategies.sampled_from(going_on)))
+
+    def make_late(self, name: str) -> None:
+        job = self.world.jobs[name]
+        self.looking.execute(LATE, (name,))
+        self.late[name] = len(job.events)
+        self.world = replace(self.world, jobs={**self.world.jobs, name: replace(job, late=True)})
+
     def agree(self, worlds: list[World], what: str) -> None:
         """The database is where one of them is; tokens that nobody was told are as they are."""
         seen, rows = observe(self.looking)
@@ -190,7 +208,7 @@ class Promises(RuleBasedStateMachine):
         assert fitting, f"after {what} the jobs are {seen}, not {[dict(world.jobs) for world in worlds]}"
         self.world = _resolved(fitting[0], seen)
         self.actors.ids.update({row["idempotency_key"]: row["id"] for row in rows})
-        assert broken_promises(self.looking, rows, self.accepted, self.confirmed) == []
+        assert broken_promises(self.looking, rows, self.accepted, self.confirmed, self.late) == []
 
     def learn(self, act: Act, answer: object) -> None:
         """What clients and workers know from here on."""
@@ -214,7 +232,7 @@ class Promises(RuleBasedStateMachine):
         self.runner.run(self.finish())
         seen, rows = observe(self.looking)
         assert {name: job.state for name, job in seen.items() if not job.final or job.place != "over"} == {}
-        assert broken_promises(self.looking, rows, self.accepted, self.confirmed) == []
+        assert broken_promises(self.looking, rows, self.accepted, self.confirmed, self.late) == []
 
     async def finish(self) -> None:
         (worker,) = self.actors.workers

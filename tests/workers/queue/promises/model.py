@@ -14,7 +14,7 @@ Place = Literal["todo", "later", "doing", "over"]
 FENCED = "fenced"
 COUNTED = {"killed", "error"}
 MAX_CRASHES, MAX_LOSSES, MAX_ATTEMPTS = 3, 9, 30
-ENDS = {"succeeded", "failed", "cancelled"}
+ENDS = {"succeeded", "failed", "cancelled", "missed"}
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,7 @@ class Job:
     setback: str | None = None
     token: uuid.UUID | None = None
     cancel_requested: bool = False
+    late: bool = False
     stage: str | None = None
     checkpoint: str | None = None
     stage_work: str | None = None
@@ -107,6 +108,30 @@ def cancelled_by_client(name: str) -> Change:
     return change
 
 
+def _beyond_its_time(job: Job) -> Job:
+    """What never started is missed. What has ends at once where it waits, or else is asked to."""
+    place = "doing" if job.place == "doing" else "over"
+    job = replace(job, place=place, abort=job.abort or place == "doing")
+    if "started" not in job.events:
+        return job.with_event("missed", state="missed")
+    job = replace(job, cancel_requested=True)
+    return job.ended("cancelled") if job.state == "queued" else job.with_event("cancel_requested")
+
+
+def late_ones_ended(names: frozenset[str] | None) -> Change:
+    """A janitor ends what is beyond its time, but for what others have locked: ``names``, or all."""
+
+    def change(world: World) -> Outcome:
+        jobs = dict(world.jobs)
+        for name, job in jobs.items():
+            due = job.late and not job.final and not job.cancel_requested
+            if due and (names is None or name in names):
+                jobs[name] = _beyond_its_time(job)
+        return names, replace(world, jobs=jobs)._offered()
+
+    return change
+
+
 def taken(worker: int) -> Change:
     """What the worker has already, or else the next that is due."""
 
@@ -124,8 +149,8 @@ def taken(worker: int) -> Change:
 
 
 def claimed(name: str, worker: int, token: uuid.UUID | None) -> Change:
-    """A new attempt, unless the worker has lost the entry, or the job is over, should be cancelled, or crashed too
-    often. ``token``: its own.
+    """A new attempt, unless the worker has lost the entry, or the job is over, should be cancelled, is late, or crashed
+    too often. ``token``: its own.
     """
 
     def change(world: World) -> Outcome:
@@ -134,8 +159,10 @@ def claimed(name: str, worker: int, token: uuid.UUID | None) -> Change:
             return False, world
         if job.state == "running":  # its last attempt is fenced, which never said how it ended
             job = replace(job, token=None)
-        if job.cancel_requested:
-            return False, world.with_job(name, job.ended("cancelled"))
+        if job.late and not job.cancel_requested:
+            job = _beyond_its_time(job)
+        if job.cancel_requested or job.late:
+            return False, world.with_job(name, job if job.final else job.ended("cancelled"))
         if job.crashes >= MAX_CRASHES or job.losses >= MAX_LOSSES or job.attempt >= MAX_ATTEMPTS:
             return False, world.with_job(name, job.ended("failed"))
         running = replace(job, state="running", attempt=job.attempt + 1, token=token, stage=None)

@@ -45,6 +45,7 @@ def _job(row: Mapping[str, Any]) -> Job:
     same = ("state", "attempt", "crashes", "losses", "setback", "cancel_requested", "stage", "held")
     return Job(
         **{name: row[name] for name in same},
+        late=row["start_by"] is not None,
         token=row["run_token"],
         checkpoint=None if row["checkpoint"] is None else row["checkpoint"]["prefix"].removeprefix(root),
         stage_work=_stage_work(row),
@@ -68,6 +69,7 @@ def broken_promises(
     rows: list[dict[str, Any]],
     accepted: set[str],
     confirmed: Mapping[str, int],
+    late: Mapping[str, int],
 ) -> list[str]:
     """What of the promises does not hold, read from the rows alone.
 
@@ -75,6 +77,7 @@ def broken_promises(
         accepted: names of the jobs whose submission was answered.
         confirmed: names of jobs whose cancellation was answered while they were not over, and how many events
             their history had then.
+        late: likewise of jobs whose deadline has passed.
     """
     broken = [f"{name} is lost" for name in accepted - {row["idempotency_key"] for row in rows}]
     for row in rows:
@@ -88,12 +91,14 @@ def broken_promises(
             "goes on after its end": not ends or events[-1] == row["state"],
             "is unfinished and not in the queue once": final or row["live_entries"] == 1,
             "started or succeeded after its cancellation": not {"started", "succeeded"} & set(after),
+            "started after its deadline": "started" not in events[late.get(name, len(events)) :],
             "shows a result without having succeeded": not row["artifacts"] or row["state"] == "succeeded",
             "shows files of two attempts": len({item["key"].split("/")[3] for item in row["artifacts"]}) <= 1,
             "has a result that is to be deleted": not row["artifacts"]
             or row["kept"] == [row["artifacts"][0]["key"].split("/")[3]],
             "counts more attempts than it started": row["attempt"] <= events.count("started"),
             "has lost the work of a stage, or keeps another's": not final
+            or row["state"] == "missed"  # without any
             or row["kept_work"] == [work and work.rpartition("/")[2]],
             "has a checkpoint that is to be deleted": final
             or row["checkpoint"] is None

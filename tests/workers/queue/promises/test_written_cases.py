@@ -33,6 +33,14 @@ class Play:
             if step == "claim" and self._cancelling:
                 self._perform(self.machine.actors.possible(self.machine.world), "client: cancel job0", set())
 
+    def is_late(self, ends: bool = True) -> None:
+        """The job's deadline passes, and a janitor sees it."""
+        self.machine.make_late("job0")
+        if ends:
+            self._perform(
+                self.machine.actors.possible(self.machine.world), "janitor: end what is late", set()
+            )
+
     def is_taken_for_dead(self, number: int) -> None:
         """It falls silent, and its job goes back to the queue."""
         self.machine.silence(self.workers[number])
@@ -96,6 +104,32 @@ def test_a_write_whose_answer_was_lost_is_done_once(database_url: str, tmp_path:
             play.does(0, "take", "claim")
             play.does(0, write, lost=True)
             play.end()
+
+
+def test_beyond_its_deadline_a_job_ends_once_whoever_sees_it_first(database_url: str, tmp_path: Path):
+    before = ((), ("take",), ("take", "claim"), ("take", "claim", "give back (None)"))
+    with promises_on(database_url, tmp_path) as promises:
+        for steps in before:
+            for ends in (True, False):
+                play = Play(promises)
+                play.does(0, *steps)
+                play.is_late(ends)
+                if steps == ("take",):
+                    play.does(0, "claim", "acknowledge over")
+                play.is_taken_for_dead(0)
+                play.end()
+        for write in ENDS:
+            play = Play(promises)
+            play.does(0, "take", "claim")
+            play.is_late()
+            play.does(0, write)
+            play.end()
+        for at in range(12):
+            for pair in itertools.permutations(("janitor: end what is late", "client: cancel job0")):
+                play = Play(promises)
+                play.is_late(ends=False)
+                play.meet(*pair, at)
+                play.end()
 
 
 def test_an_attempt_ends_once_however_often_it_says_so(database_url: str, tmp_path: Path):

@@ -160,6 +160,7 @@ $$;
 -- was joined stays when the other is deleted.) `share_round`: signed into links to its files; the next one ends them.
 -- `key_id`: the API key that submitted it. `attempt_…`: of the latest attempt, when it began, when it was last known to
 -- run, and its processor seconds until then; `processor_s`, `wall_s`, `gpu_s`: what all attempts that are over used.
+-- `start_by`: a job that has not started by then ends as missed; never after `deadline_at`, at which all else of it ends.
 -- fillfactor leaves space in each page, so that progress updates stay HOT (no index writes).
 CREATE TABLE jobs (
     id text PRIMARY KEY,
@@ -171,7 +172,7 @@ CREATE TABLE jobs (
     forked_stage text,
     fixed_from text,
     state text NOT NULL DEFAULT 'queued'
-        CHECK (state IN ('queued', 'running', 'succeeded', 'failed', 'cancelled', 'expired')),
+        CHECK (state IN ('queued', 'running', 'succeeded', 'failed', 'cancelled', 'missed', 'expired')),
     options jsonb NOT NULL,
     planned_steps int,
     resolved_options jsonb,
@@ -220,6 +221,8 @@ CREATE TABLE jobs (
     seq bigint NOT NULL DEFAULT 0,
     revision bigint NOT NULL DEFAULT 0,
     created_at timestamptz NOT NULL DEFAULT clock_timestamp(),
+    start_by timestamptz CHECK (start_by <= deadline_at),
+    deadline_at timestamptz,
     started_at timestamptz,
     finished_at timestamptz,
     updated_at timestamptz NOT NULL DEFAULT clock_timestamp(),
@@ -236,6 +239,7 @@ CREATE INDEX jobs_waiting ON jobs (queue_order, queue_id) WHERE state = 'queued'
 CREATE INDEX jobs_waiting_of_tenant ON jobs (tenant, priority, turn) WHERE state = 'queued';
 CREATE INDEX jobs_held ON jobs (tenant, queue_order, queue_id) WHERE held AND state = 'queued';
 CREATE INDEX jobs_offered ON jobs (tenant) WHERE NOT held AND state IN ('queued', 'running');
+CREATE INDEX jobs_due ON jobs (start_by) WHERE start_by IS NOT NULL AND state IN ('queued', 'running');
 CREATE INDEX jobs_expiry ON jobs (expires_at) WHERE expires_at IS NOT NULL;
 CREATE INDEX jobs_over ON jobs (finished_at) WHERE finished_at IS NOT NULL;
 CREATE INDEX jobs_fixed ON jobs (fixed_from) WHERE fixed_from IS NOT NULL;

@@ -220,7 +220,7 @@ BEGIN
 END;
 $$;
 CREATE TRIGGER tell_of_job AFTER INSERT ON job_events FOR EACH ROW
-    WHEN (NEW.type IN ('queued', 'started', 'succeeded', 'failed', 'cancelled'))
+    WHEN (NEW.type IN ('queued', 'started', 'succeeded', 'failed', 'cancelled', 'missed'))
     EXECUTE FUNCTION tell_of_job();
 
 CREATE FUNCTION tell_of_dataset() RETURNS trigger LANGUAGE plpgsql AS $$
@@ -249,7 +249,7 @@ $$;
 -- Only these end a stage: previews and checkpoints fall into the middle of one.
 CREATE FUNCTION tally_job_event() RETURNS trigger LANGUAGE plpgsql AS $$
 DECLARE
-    _marks text[] := '{started,stage,attempt_crashed,retried_smaller,requeued,succeeded,failed,cancelled}';
+    _marks text[] := '{started,stage,attempt_crashed,retried_smaller,requeued,succeeded,failed,cancelled,missed}';
     _created timestamptz;
     _before record;
 BEGIN
@@ -267,7 +267,7 @@ BEGIN
     IF FOUND AND _before.type = 'stage' THEN
         PERFORM tally_seconds('stage_seconds', coalesce(_before.stage, ''), extract(epoch FROM NEW.at - _before.at));
     END IF;
-    IF NEW.type IN ('started', 'succeeded', 'failed', 'cancelled') THEN
+    IF NEW.type IN ('started', 'succeeded', 'failed', 'cancelled', 'missed') THEN
         SELECT created_at INTO _created FROM jobs WHERE id = NEW.job_id;
         IF NEW.type <> 'started' THEN
             PERFORM tally_seconds('job_seconds', NEW.type, extract(epoch FROM NEW.at - _created));
