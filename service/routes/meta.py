@@ -1,4 +1,4 @@
-"""What the service says of itself: version, limits, the options of jobs, and what jobs used."""
+"""What the service says of itself: version, limits, the options of jobs, what jobs used and do."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from fastapi import APIRouter, Header, Query, Response
 from biresnerf import __version__
 from biresnerf.options.presets import PRESETS
 from biresnerf.options.refine_options import RefineOptions
+from biresnerf.wire.operator import OperatorView
 from biresnerf.wire.service import Info, OptionsView, SizeLimits, UsageKey, UsageList, UsageRow
-from service.http.access import ReadCaller
+from service.http.access import Admin, ReadCaller
 from service.http.dependencies import IfNoneMatch
 from service.http.http_conditionals import none_match
 from service.http.problems import wrong_field
@@ -112,3 +113,11 @@ async def get_usage(
     table.writeheader()
     table.writerows(row.model_dump() for row in rows)
     return Response(text.getvalue(), media_type=CSV)
+
+
+@router.get("/v1/operator")
+async def get_operator_view(caller: Admin, response: Response) -> OperatorView:
+    """The installation at work, of all tenants: queue, slots and what they do, sizes, the latest failures."""
+    response.headers["Cache-Control"] = "no-store"
+    seen = await caller.service.stores.monitor.overview()
+    return seen.model_copy(update={"upload_room_bytes": caller.service.disk_budget.free_bytes()})

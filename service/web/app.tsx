@@ -8,12 +8,13 @@ import { ExamplePage } from "./job/example_page";
 import { JobPage } from "./job/page";
 import { JobsPage } from "./jobs/list";
 import { SharedPage } from "./job/shared_page";
+import { OperatorLink, OperatorPage } from "./operator/page";
 import { ErrorBoundary } from "./parts/error_boundary";
 import { KeyForm } from "./parts/key_form";
 import { DatasetPage } from "./upload/dataset_page";
 
 interface Route {
-  name: "jobs" | "job" | "dataset" | "compare" | "shared" | "example";
+  name: "jobs" | "job" | "dataset" | "compare" | "shared" | "example" | "operator";
   id: string;
   /** The second job of a comparison; the token of a link. */
   other?: string;
@@ -25,8 +26,11 @@ function routeOf(hash: string): Route {
   if (kind === "datasets" && id) return { name: "dataset", id };
   if (kind === "compare" && id && other) return { name: "compare", id, other };
   if (kind === "shared" && id && other) return { name: "shared", id, other };
-  return { name: kind === "example" ? kind : "jobs", id: "" };
+  return { name: kind === "example" || kind === "operator" ? kind : "jobs", id: "" };
 }
+
+/** Pages that need no key. */
+const OPEN: ReadonlySet<Route["name"]> = new Set(["shared", "example"]);
 
 function App() {
   const [route, setRoute] = useState(() => routeOf(location.hash));
@@ -57,6 +61,7 @@ function App() {
               Jobs
             </a>
           )}
+          {!OPEN.has(route.name) && keyError === null && <OperatorLink key={key} here={route.name === "operator"} />}
           <a href="docs">API</a>
           {key && route.name !== "shared" && (
             <button class="plain-link" onClick={() => setKey(null)}>
@@ -83,6 +88,7 @@ function View({ name, id, other = "" }: Route) {
   if (name === "compare") return <ComparePage ids={[id, other]} />;
   if (name === "job") return <JobPage id={id} />;
   if (name === "example") return <ExamplePage />;
+  if (name === "operator") return <OperatorPage />;
   if (name === "dataset") return <DatasetPage id={id} />;
   return <JobsPage />;
 }

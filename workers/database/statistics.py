@@ -54,8 +54,8 @@ _LIVING = """slots JOIN queue_workers AS worker ON worker.id = slots.worker_id
     AND worker.last_heartbeat > now() - make_interval(secs => %s)"""
 _SLOTS = f"""
     SELECT slots.kind,
-        EXISTS (SELECT FROM queue_entries AS entry JOIN running_refinements ON queue_id = entry.id
-            WHERE entry.worker_id = worker.id AND entry.state = 'doing') AS busy,
+        EXISTS (SELECT FROM queue_entries AS entry JOIN running_jobs AS job ON job.queue_id = entry.id
+            WHERE entry.worker_id = worker.id AND entry.state = 'doing' AND job.kind = 'refine') AS busy,
         count(*) AS slots
     FROM {_LIVING} GROUP BY 1, 2"""
 _TALLIES = """

@@ -6,11 +6,13 @@ import asyncio
 from collections.abc import Awaitable
 from typing import Literal
 
+from biresnerf.wire.operator import OperatorView
 from workers.database.database import Database
 from workers.database.migrate import step_names
 from workers.database.statistics import Statistics, living_slots, read_statistics
 from workers.settings.errors import Unavailable
 from workers.store.files import FileStore
+from workers.upkeep.overview import read_overview
 
 Need = Literal["database", "storage", "queue"]
 # A probe that waits longer than its caller tells nothing.
@@ -31,6 +33,10 @@ class Monitor:
     async def statistics(self) -> Statistics:
         """The figures; raises `Unavailable`."""
         return await read_statistics(self._database, self._stall_s)
+
+    async def overview(self) -> OperatorView:
+        """What its operator wants to see of the installation; raises `Unavailable`."""
+        return await read_overview(self._database, self._stall_s)
 
     async def living_workers(self) -> int:
         """Worker slots that sent a heartbeat within the stall time; raises `Unavailable`."""

@@ -49,7 +49,7 @@ const WITHOUT_RESULT: Record<string, { title: string; words: string }> = {
   expired: { title: "Its files have expired", words: "The images may still be there: run the job again." },
   cancelled: { title: "Cancelled", words: "Only its log was kept. Run it again or fork it to continue." },
 };
-const HEADINGS: Record<string, string> = {
+export const HEADINGS: Record<string, string> = {
   timeout: "The job took longer than the service allows",
   out_of_memory: "The job ran out of memory",
   too_many_crashes: "The job crashed repeatedly",

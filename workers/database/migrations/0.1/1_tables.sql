@@ -277,8 +277,17 @@ CREATE VIEW job_file_keys AS
     UNION SELECT (checkpoint ->> 'prefix') || '/' || name
         FROM jobs, jsonb_array_elements_text(checkpoint -> 'files') AS name WHERE checkpoint IS NOT NULL;
 
--- Whether a slot is busy: exports do not count.
-CREATE VIEW running_refinements AS SELECT queue_id FROM jobs WHERE kind = 'refine' AND state = 'running';
+CREATE VIEW running_jobs AS
+    SELECT id, tenant, kind, queue_id, attempt, stage, fraction, attempt_started_at AS since FROM jobs
+    WHERE state = 'running';
+CREATE VIEW failed_jobs AS
+    SELECT id, tenant, finished_at, error ->> 'code' AS code, error ->> 'detail' AS detail FROM jobs
+    WHERE state = 'failed';
+CREATE VIEW unfinished_jobs AS
+    SELECT priority, count(*) FILTER (WHERE state = 'queued' AND NOT held) AS waiting,
+        count(*) FILTER (WHERE state = 'queued' AND held) AS held, count(*) FILTER (WHERE state = 'running') AS running,
+        min(created_at) FILTER (WHERE state = 'queued') AS oldest_at
+    FROM jobs WHERE state IN ('queued', 'running') GROUP BY priority;
 -- How much work waits, for autoscalers and monitoring. Names and columns of this view are kept: what runs outside of
 -- this program reads it (docs/operations.md). A role needs no other right than SELECT on it.
 -- A slot of any kind takes any job, so that `waiting`, `held` and `oldest_s` are the same for each kind. `held` jobs
