@@ -32,6 +32,7 @@ from service.intake.json_body import validation_problem
 from service.intake.uploads import sweep_staging
 from service.routes import (
     artifacts,
+    batches,
     datasets,
     derived_jobs,
     events,
@@ -61,6 +62,7 @@ _RESOURCES = (
     uploads,
     signed_uploads,
     jobs,
+    batches,
     derived_jobs,
     events,
     artifacts,

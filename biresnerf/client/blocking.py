@@ -93,6 +93,10 @@ class Client:
     fork = _blocking(AsyncClient.fork)
     delete_job = _blocking(AsyncClient.delete_job)
     log = _blocking(AsyncClient.log)
+    create_batch = _blocking(AsyncClient.create_batch)
+    batch = _blocking(AsyncClient.batch)
+    wait_for_batch = _blocking(AsyncClient.wait_for_batch)
+    cancel_batch = _blocking(AsyncClient.cancel_batch)
 
     artifacts = _blocking(AsyncClient.artifacts)
     download = _blocking(AsyncClient.download)

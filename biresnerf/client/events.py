@@ -16,6 +16,7 @@ from biresnerf.client.errors import JobNotOver, ServiceError
 from biresnerf.client.job_calls import JobCalls
 from biresnerf.client.retries import Retries
 from biresnerf.client.transport import Call, tell
+from biresnerf.wire.batches import BatchView
 from biresnerf.wire.jobs import FINAL_JOB_STATES, JobEvent, JobView, job_url
 
 # The service sends a comment every 15 s; after three missing ones the connection is dead.
@@ -82,6 +83,18 @@ class Events(JobCalls):
             if on_progress is not None and (job := event.job) is not None:
                 await tell(on_progress, job)
         return await self.job(job_id)
+
+    async def wait_for_batch(self, batch_id: str, *, timeout_s: float | None = None) -> BatchView:
+        """Waits until all jobs of the batch are over and returns it, however they ended.
+
+        Raises:
+            JobNotOver: one of its jobs is not over after ``timeout_s``.
+        """
+        deadline = math.inf if timeout_s is None else anyio.current_time() + timeout_s
+        for job in (await self.batch(batch_id)).jobs:
+            left_s = None if timeout_s is None else max(0.0, deadline - anyio.current_time())
+            await self.wait(job.id, timeout_s=left_s)
+        return await self.batch(batch_id)
 
     async def _follow(self, job_id: str, after: int) -> AsyncGenerator[StreamEvent]:
         retries, reconnect_s, last = Retries(self._policy), _PAUSE_S, after

@@ -14,6 +14,7 @@ from biresnerf.options.formats import ExportName
 from biresnerf.options.refine_options import RefineOptions, parse_options
 from biresnerf.report import Report
 from biresnerf.wire.base import LABEL_LENGTH, LABELS_MOST
+from biresnerf.wire.batches import BatchView, NewBatch, batch_url
 from biresnerf.wire.jobs import (
     CancelJob,
     ForkJob,
@@ -28,6 +29,7 @@ from biresnerf.wire.jobs import (
     job_url,
 )
 from biresnerf.wire.results import ArtifactList, ArtifactView, ImageList, NewShare, ShareView
+from biresnerf.wire.webhooks import BatchWebhook
 
 OptionsLike: TypeAlias = RefineOptions | Mapping[str, Any] | None
 _LOG_LINES = 1000
@@ -53,6 +55,27 @@ class JobCalls(Transport):
             **details,
         )
         return await self._queue("/v1/jobs", body, idempotency_key)
+
+    async def create_batch(
+        self,
+        jobs: Sequence[NewJob],
+        *,
+        webhook: BatchWebhook | None = None,
+        idempotency_key: str | None = None,
+    ) -> BatchView:
+        """Queues all of the jobs, or none. Requests with the same key queue them once and return the same batch."""
+        body = NewBatch(jobs=tuple(jobs), webhook=webhook).model_dump(mode="json", exclude_unset=True)
+        headers = {"Idempotency-Key": idempotency_key or uuid.uuid4().hex}
+        return parse(await self._ask(Call("POST", "/v1/batches", json=body, headers=headers)), BatchView)
+
+    async def batch(self, batch_id: str) -> BatchView:
+        """The batch as it is now."""
+        return parse(await self._ask(Call("GET", batch_url(batch_id))), BatchView)
+
+    async def cancel_batch(self, batch_id: str, *, keep_partial: bool = False) -> BatchView:
+        """Asks for the jobs of a batch to end, as `cancel` does."""
+        body = CancelJob(keep_partial=keep_partial).model_dump()
+        return parse(await self._ask(Call("POST", f"{batch_url(batch_id)}/cancel", json=body)), BatchView)
 
     async def _queue(self, path: str, body: NewJob | ForkJob, key: str | None) -> JobView:
         headers = {"Idempotency-Key": key or uuid.uuid4().hex}

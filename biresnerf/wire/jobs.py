@@ -102,6 +102,7 @@ class JobView(Record):
         None,
         description="The job whose poses and lenses the photos that both have keep; the others join its frame.",
     )
+    batch_id: str | None = Field(None, description="The batch that it was submitted in.")
     dataset_id: str = Field(examples=["ds_01JD8Y3V1QKZ5M0C7W2N4T6XAB"])
     state: JobState = Field(examples=["running"])
     stage: Stage | None = Field(None, examples=["coarse"])

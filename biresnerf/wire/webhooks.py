@@ -20,6 +20,7 @@ WebhookEvent = Literal[
     "job.failed",
     "job.cancelled",
     "job.missed",
+    "batch.finished",
     "dataset.validated",
 ]
 ALL_EVENTS: tuple[WebhookEvent, ...] = get_args(WebhookEvent)
@@ -74,6 +75,9 @@ class WebhookView(Record):
     job_id: str | None = Field(
         None, description="Only events of this job are sent; the webhook is deleted with the job."
     )
+    batch_id: str | None = Field(
+        None, description="Only the end of this batch is sent; the webhook is deleted with the batch."
+    )
     enabled: bool = Field(examples=[True])
     disabled_why: str | None = Field(None, description="Why the service disabled it; null if it did not.")
     failing_since: datetime | None = Field(None, description="No delivery has succeeded since then.")
@@ -124,8 +128,8 @@ class DeliveryView(Record):
     )
 
 
-class JobWebhook(Record):
-    """A webhook for one job, part of its request. The client chooses the secret."""
+class BatchWebhook(Record):
+    """A webhook for the end of one batch, part of its request. The client chooses the secret."""
 
     url: str = Field(max_length=2000)
     secret: Secret = Field(
@@ -133,6 +137,11 @@ class JobWebhook(Record):
         description="`whsec_` and 24 to 64 random bytes in base64; signs the messages.",
         examples=["whsec_MfKQ9r8GKYqrTwjUPD8ILPZIo2LaLaSw"],
     )
+
+
+class JobWebhook(BatchWebhook):
+    """A webhook for one job, part of its request. The client chooses the secret."""
+
     events: tuple[WebhookEvent, ...] = Field(
         ("job.succeeded", "job.failed", "job.cancelled", "job.missed"),
         min_length=1,

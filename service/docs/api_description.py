@@ -25,6 +25,7 @@ _NEXT = {
     "uploadArchive": ("200", "dataset_id", ["finalizeDataset"]),
     "finalizeDataset": ("200", "dataset_id", ["submitJob"]),
     "submitJob": ("202", "job_id", ["getJob", "cancelJob"]),
+    "submitBatch": ("202", "batch_id", ["getBatch", "cancelBatch"]),
 }
 # Problems of every operation, and of those with a JSON body; `REFUSALS` are those of guarded operations.
 _ANY = ("malformed_request", "head_timeout", "headers_too_large", "internal_error")

@@ -161,6 +161,7 @@ def _checked_id(identity: str) -> str:
 
 _ID_FORM = AfterValidator(_checked_id)
 JobId = Annotated[str, PathParameter(examples=["job_01JD8Y3V1QKZ5M0C7W2N4T6XAB"]), _ID_FORM]
+BatchId = Annotated[str, PathParameter(examples=["bat_01JD8Y3V1QKZ5M0C7W2N4T6XAB"]), _ID_FORM]
 DatasetId = Annotated[str, PathParameter(examples=["ds_01JD8Y3V1QKZ5M0C7W2N4T6XAB"]), _ID_FORM]
 UploadId = Annotated[str, PathParameter(examples=["up_01JD8Y3V1QKZ5M0C7W2N4T6XAB"]), _ID_FORM]
 WebhookId = Annotated[str, PathParameter(examples=["wh_01JD8Y3V1QKZ5M0C7W2N4T6XAB"]), _ID_FORM]

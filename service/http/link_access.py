@@ -24,4 +24,5 @@ def shown_to_strangers(job: JobView) -> JobView:
     """The job without its tenant, key, labels, dataset, and the jobs that it was made from."""
     links = job.links.model_copy(update={"dataset": ""})
     owners: dict[str, Any] = {"tenant": "", "key_id": None, "labels": {}, "dataset_id": "", "links": links}
-    return job.model_copy(update={**owners, "parent": None, "forked_from": None, "fixed_from": None})
+    others = dict.fromkeys(("parent", "forked_from", "fixed_from", "batch_id"))
+    return job.model_copy(update={**owners, **others})

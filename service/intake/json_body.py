@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterable
 from contextlib import asynccontextmanager
 from typing import Any, TypeVar
@@ -107,7 +108,7 @@ def _no_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def validation_problem(found: Iterable[Any]) -> ProblemError:
     """Pydantic's findings as one problem; ``invalid_options`` where an option is at fault."""
     fields = [FieldProblem(pointer=_pointer(item["loc"]), detail=_detail(item)) for item in found]
-    in_options = any(field.pointer.startswith("#/options") for field in fields)
+    in_options = any(re.match(r"#(/jobs/\d+)?/options", field.pointer) for field in fields)
     return ProblemError(
         "invalid_options" if in_options else "invalid_request",
         "; ".join(f"{field.pointer}: {field.detail}" for field in fields[:10]),

@@ -15,6 +15,7 @@ from service.http.http_conditionals import none_match
 from service.http.link_access import shown_to_strangers
 from service.http.problems import ProblemError, declared, wrong_field
 from service.intake.json_body import JsonRoute, json_content, read_json, validate
+from service.intake.one_shot import PLAIN, TEXTS, submit_form
 from service.responses.job_responses import (
     POLL_S,
     IdempotencyKey,
@@ -23,7 +24,6 @@ from service.responses.job_responses import (
     preferred_wait_s,
     waited_for,
 )
-from service.routes.one_shot import PLAIN, TEXTS, submit_form
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], route_class=JsonRoute)
 _FORM: dict[str, Any] = {

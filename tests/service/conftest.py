@@ -282,6 +282,7 @@ class Tenant:
     webhook: str
     delivery: str
     link: str
+    batch: str
 
 
 @pytest.fixture(scope="session")
@@ -296,7 +297,10 @@ def tenants(closed: Running, scene: Path) -> Iterator[tuple[Tenant, Tenant]]:
         webhook = http.post("/v1/webhooks", json={"url": "http://127.0.0.1:9/in"}).json()["id"]
         delivery = http.post(f"/v1/webhooks/{webhook}/test").json()["id"]
         link = http.post(f"/v1/jobs/{job}/links", json={}).json()["id"]
-        made.append(Tenant(http, key, dataset, job, new_upload(http), webhook, delivery, link))
+        batch = http.post("/v1/batches", json={"jobs": [{"dataset_id": dataset}]}).json()
+        http.post(batch["links"]["cancel"])
+        finished(http, batch["jobs"][0]["id"])
+        made.append(Tenant(http, key, dataset, job, new_upload(http), webhook, delivery, link, batch["id"]))
     yield made[0], made[1]
     for tenant in made:
         tenant.http.close()

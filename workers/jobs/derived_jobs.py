@@ -91,7 +91,7 @@ class DerivedJobs(JobStore):
         fingerprint: str,
     ) -> JobView | None:
         """The job of an earlier request with this key; none where there is room for a new one."""
-        await submitting_for(connection, parent["dataset_id"], self._tenant)
+        await submitting_for(connection, {parent["dataset_id"]}, self._tenant)
         if idempotency_key is not None:
             known = await known_job(connection, parent["tenant"], idempotency_key, fingerprint)
             if known is not None:
@@ -126,7 +126,7 @@ class DerivedJobs(JobStore):
         async with self._database.transaction() as connection:
             parent = await self._required(connection, job_id)
             require_result(parent)
-            await submitting_for(connection, parent["dataset_id"], self._tenant)
+            await submitting_for(connection, {parent["dataset_id"]}, self._tenant)
             same = await connection.row(
                 JOB + " WHERE parent = %s AND fingerprint = %s AND kind = 'export'"
                 " AND state IN ('queued', 'running', 'succeeded')",

@@ -88,12 +88,12 @@ async def drop_left_checkpoints(connection: Connection, stall_s: float) -> None:
 
 
 async def forget_keys(connection: Connection, kept_s: float) -> None:
-    """Idempotency keys of jobs that ended so long ago can be used again."""
-    await connection.execute(
-        "UPDATE jobs SET idempotency_key = NULL WHERE idempotency_key IS NOT NULL"
-        " AND finished_at < now() - make_interval(secs => %s)",
-        (kept_s,),
-    )
+    """Idempotency keys of jobs and batches that ended so long ago can be used again."""
+    for sql in ("UPDATE jobs SET idempotency_key = NULL", "UPDATE batches SET idempotency_key = NULL"):
+        await connection.execute(
+            f"{sql} WHERE idempotency_key IS NOT NULL AND finished_at < now() - make_interval(secs => %s)",
+            (kept_s,),
+        )
 
 
 async def delete_expired_jobs(connection: Connection, kept_s: float) -> None:

@@ -43,7 +43,7 @@ from workers.settings.errors import Conflict, Expired
 from workers.settings.settings import Settings
 from workers.settings.traces import traced
 from workers.tenants.tenants import LOCAL_TENANT
-from workers.webhooks.webhooks import add_job_webhook
+from workers.webhooks.webhooks import add_webhook
 
 
 class JobStore(OwnedStore):
@@ -87,7 +87,7 @@ class JobStore(OwnedStore):
         columns = asked_columns(options)
         fingerprint = submission_fingerprint(request_digest or dataset_id, asked)
         async with self._database.transaction() as connection:
-            tenant = await submitting_for(connection, dataset_id, self._tenant)
+            tenant = await submitting_for(connection, {dataset_id}, self._tenant)
             if idempotency_key is not None:
                 known = await known_job(connection, tenant, idempotency_key, fingerprint)
                 if known is not None:
@@ -116,8 +116,8 @@ class JobStore(OwnedStore):
                 **columns,
             },
         )
-        if asked.webhook is not None:
-            await add_job_webhook(connection, self._settings, columns["tenant"], job_id, asked.webhook)
+        if (hook := asked.webhook) is not None:
+            await add_webhook(connection, self._settings, columns["tenant"], hook, hook.events, job_id=job_id)
         await queue_job(connection, added)  # an event that the webhook is to get
         return job_id
 

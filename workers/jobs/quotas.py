@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 from workers.database.database import Connection
-from workers.settings.errors import Conflict, LimitReached
+from workers.settings.errors import Conflict, LimitReached, NotFound
 
 
-async def submitting_for(connection: Connection, dataset_id: str, seen_by: str | None) -> str:
-    """The tenant of jobs on the dataset, whose submits take turns from here to the end of the transaction.
+async def submitting_for(connection: Connection, dataset_ids: Collection[str], seen_by: str | None) -> str:
+    """The tenant of jobs on the datasets, whose submits take turns from here to the end of the transaction.
 
     So no two of them take its last place, or the same idempotency key. Other tenants' do not wait for them: at the
     limit of the whole queue as many jobs more can get in as submits run at that moment.
 
-    Raises `NotFound` where the tenant ``seen_by`` does not see the dataset.
+    Raises `NotFound` where the tenant ``seen_by`` does not see one of them.
     """
-    # The dataset before the tenant, as uploads lock them.
-    sql = "SELECT tenant FROM datasets WHERE id = %s AND tenant = coalesce(%s, tenant) FOR SHARE"
-    row = await connection.required_row(f"No dataset {dataset_id}.", sql, dataset_id, seen_by)
-    await _lock_tenant(connection, row["tenant"])
-    return str(row["tenant"])
+    # Datasets before the tenant, as uploads lock them.
+    sql = "SELECT id, tenant FROM datasets WHERE id = ANY(%s) AND tenant = coalesce(%s, tenant) ORDER BY id FOR SHARE"
+    rows = await connection.rows(sql, list(dataset_ids), seen_by)
+    for missing in sorted(set(dataset_ids) - {row["id"] for row in rows}):
+        raise NotFound(f"No dataset {missing}.")
+    tenant = str(rows[0]["tenant"])
+    await _lock_tenant(connection, tenant)
+    return tenant
 
 
 async def require_room(connection: Connection, dataset_id: str, priority: int, max_queued: int) -> None:

@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from biresnerf.wire.base import Page
-from biresnerf.wire.webhooks import DeliveryView, JobWebhook, WebhookEvent, WebhookView, new_secret
+from biresnerf.wire.webhooks import BatchWebhook, DeliveryView, WebhookEvent, WebhookView, new_secret
 from workers.database.database import Connection, Database, OwnedStore
 from workers.database.ids import new_id
 from workers.records import NEWEST_FIRST, newest_first, page_of, record_from_row
@@ -51,7 +51,7 @@ class WebhookStore(OwnedStore):
         secret = new_secret()
         async with self._database.transaction() as connection:
             await connection.execute("SELECT 1 FROM tenants WHERE id = %s FOR NO KEY UPDATE", (tenant,))
-            have = "SELECT count(*) FROM webhooks WHERE tenant = %s AND job_id IS NULL"
+            have = "SELECT count(*) FROM webhooks WHERE tenant = %s AND coalesce(job_id, batch_id) IS NULL"
             if await connection.value(have, tenant) >= self._settings.max_webhooks:
                 raise LimitReached(
                     "too_many_webhooks", f"There are {self._settings.max_webhooks} webhooks already."
@@ -71,9 +71,13 @@ class WebhookStore(OwnedStore):
     async def list(
         self, *, job_id: str | None = None, limit: int = 50, cursor: str | None = None
     ) -> Page[WebhookView]:
-        """Webhooks, newest first: those for all jobs, or those of one; raises `InputError` (``bad_cursor``)."""
+        """Webhooks, newest first: those for all jobs, or those of one job or batch.
+
+        Raises `InputError` (``bad_cursor``).
+        """
         rows = await self._database.fetch(
-            f"SELECT * FROM webhooks WHERE {_MINE} AND job_id IS NOT DISTINCT FROM %s" + NEWEST_FIRST,
+            f"SELECT * FROM webhooks WHERE {_MINE} AND coalesce(job_id, batch_id) IS NOT DISTINCT FROM %s"
+            + NEWEST_FIRST,
             *(self._tenant, job_id, *newest_first(cursor, limit)),
         )
         return page_of(map(_webhook, rows), limit)
@@ -199,17 +203,25 @@ class WebhookStore(OwnedStore):
         return await connection.required_row(f"No webhook {webhook_id}.", sql, webhook_id, self._tenant)
 
 
-async def add_job_webhook(
-    connection: Connection, settings: Settings, tenant: str, job_id: str, wanted: JobWebhook
+async def add_webhook(
+    connection: Connection,
+    settings: Settings,
+    tenant: str,
+    wanted: BatchWebhook,
+    events: Sequence[WebhookEvent],
+    *,
+    job_id: str | None = None,
+    batch_id: str | None = None,
 ) -> None:
-    """The webhook of one job, in the transaction that makes the job and before its first event.
+    """The webhook of one job or batch, in the transaction that makes it and before its first event.
 
     Raises `InputError` (``webhook_url_refused``).
     """
     target = str(checked_url(wanted.url, Policy.of(settings)))
     await connection.execute(
-        "INSERT INTO webhooks (id, tenant, job_id, url, events, secret) VALUES (%s, %s, %s, %s, %s, %s)",
-        (new_id("wh"), tenant, job_id, target, list(dict.fromkeys(wanted.events)), wanted.secret),
+        "INSERT INTO webhooks (id, tenant, job_id, batch_id, url, events, secret)"
+        " VALUES (%s, %s, %s, %s, %s, %s, %s)",
+        (new_id("wh"), tenant, job_id, batch_id, target, list(dict.fromkeys(events)), wanted.secret),
     )
 
 

@@ -95,14 +95,14 @@ def address(path: str, owner: Tenant) -> str:
         **{"dataset_id": owner.dataset, "job_id": owner.job, "upload_id": owner.upload},
         **{"path": "transforms.json", "name": "report.json", "photo": "0"},
         **{"webhook_id": owner.webhook, "delivery_id": owner.delivery, "link_id": owner.link},
+        "batch_id": owner.batch,
     }
     return re.sub(r"\{(\w+)(:\w+)?\}", lambda match: values[match[1]], path)
 
 
 def ids_of(owner: Tenant) -> dict[str, str]:
-    return {
-        name: getattr(owner, name) for name in ("dataset", "job", "upload", "webhook", "delivery", "link")
-    }
+    names = ("dataset", "job", "upload", "webhook", "delivery", "link", "batch")
+    return {name: getattr(owner, name) for name in names}
 
 
 @pytest.mark.parametrize(("method", "path"), [(method, path) for method, path, _ in GUARDED])
@@ -144,7 +144,7 @@ def test_anothers_id_is_not_found_on_any_route(tenants: tuple[Tenant, Tenant], m
 def seen_by(tenant: Tenant) -> list[Any]:
     job, dataset = f"/v1/jobs/{tenant.job}", f"/v1/datasets/{tenant.dataset}"
     paths = (job, f"{job}/artifacts", dataset, f"{dataset}/files", f"/v1/uploads/{tenant.upload}")
-    paths += (f"/v1/webhooks/{tenant.webhook}",)
+    paths += (f"/v1/webhooks/{tenant.webhook}", f"/v1/batches/{tenant.batch}")
     answers = [tenant.http.get(path) for path in paths]
     assert {answer.status_code for answer in answers} == {200}
     return [answer.json() for answer in answers]
@@ -189,6 +189,10 @@ def test_nobody_runs_a_job_on_anothers_dataset(tenants: tuple[Tenant, Tenant]):
     anna, bert = tenants
     body = {"dataset_id": anna.dataset, "options": {"preset": "fast"}}
     problem(bert.http.post("/v1/jobs", json=body), 404, "not_found")
+    mixed = {"jobs": [{"dataset_id": bert.dataset}, body]}
+    before = bert.http.get("/v1/info").json()["job_counts"]
+    problem(bert.http.post("/v1/batches", json=mixed), 404, "not_found")
+    assert bert.http.get("/v1/info").json()["job_counts"] == before
 
 
 def test_idempotency_keys_of_two_tenants_do_not_meet(tenants: tuple[Tenant, Tenant]):

@@ -172,6 +172,30 @@ def test_a_webhook_sent_along_with_a_job_hears_of_its_end_and_of_no_other(
     problem(http.get(webhook["links"]["self"]), 404, "not_found")
 
 
+def test_a_webhook_sent_along_with_a_batch_hears_once_that_all_is_over(
+    http: httpx.Client, receiver: Receiver, scene: Path
+) -> None:
+    dataset = ready_dataset(http, scene)
+    job = {"dataset_id": dataset, "options": {"preset": "fast", "steps": 20, "seed": 5}}
+    failing = {**job, "options": {**job["options"], "threads": 77}}
+    body = {"jobs": [job, failing, job], "webhook": {"url": receiver.url, "secret": SECRET}}
+    batch = http.post("/v1/batches", json=body).json()
+    for one in batch["jobs"]:
+        finished(http, one["id"])
+    over = http.get(batch["links"]["self"]).json()
+    assert over["counts"] == {"succeeded": 2, "failed": 1}
+    (webhook,) = http.get("/v1/webhooks", params={"job": batch["id"]}).json()["items"]
+    (delivery,) = http.get(webhook["links"]["deliveries"]).json()["items"]
+    assert delivered(http, delivery["links"]["self"])["state"] == "delivered"
+    ((heard, content),) = receiver.heard
+    told = standardwebhooks.Webhook(SECRET).verify(content, heard)
+    assert (told["type"], told["data"]["id"], told["data"]["counts"]) == (
+        "batch.finished",
+        batch["id"],
+        over["counts"],
+    )
+
+
 @pytest.mark.parametrize(
     ("change", "code"),
     [

@@ -310,7 +310,7 @@ async def test_submits_without_a_gap_keep_no_other_dataset_from_its_date_and_its
     async with open_database(url, answer_s=10.0) as database, open_database(url) as submitting:
         # Submits of others that overlap: one has the lock at each moment.
         async with submitting.transaction() as first:
-            await submitting_for(first, busy, None)
+            await submitting_for(first, {busy}, None)
             going_on.set()
             more = [asyncio.create_task(submits()) for _ in range(3)]
             await Expiry(database, settings).round()

@@ -150,6 +150,18 @@ CREATE FUNCTION bytes_of_artifacts(_artifacts jsonb) RETURNS bigint LANGUAGE sql
     SELECT coalesce(sum((item ->> 'size')::bigint), 0)::bigint FROM jsonb_array_elements(_artifacts) AS item
 $$;
 
+-- Jobs that were submitted together; see close_batch() and drop_batch().
+CREATE TABLE batches (
+    id text PRIMARY KEY,
+    tenant text NOT NULL REFERENCES tenants,
+    idempotency_key text,
+    fingerprint text NOT NULL,
+    created_at timestamptz NOT NULL DEFAULT clock_timestamp(),
+    finished_at timestamptz,
+    UNIQUE (tenant, idempotency_key)
+);
+CREATE INDEX batches_with_key ON batches (finished_at) WHERE idempotency_key IS NOT NULL;
+
 -- `queue_order`: priority first, then turn; lower runs earlier. `held`: the tenant has as many jobs offered or
 -- running as it may; the queue does not offer this one until one of those ends. `trace`: the W3C traceparent of the
 -- submission, which attempts join. An export of a result is a job below its `parent`. `options`: as requested;
@@ -171,6 +183,7 @@ CREATE TABLE jobs (
     forked_from text,
     forked_stage text,
     fixed_from text,
+    batch_id text REFERENCES batches,
     state text NOT NULL DEFAULT 'queued'
         CHECK (state IN ('queued', 'running', 'succeeded', 'failed', 'cancelled', 'missed', 'expired')),
     options jsonb NOT NULL,
@@ -239,6 +252,7 @@ CREATE INDEX jobs_waiting ON jobs (queue_order, queue_id) WHERE state = 'queued'
 CREATE INDEX jobs_waiting_of_tenant ON jobs (tenant, priority, turn) WHERE state = 'queued';
 CREATE INDEX jobs_held ON jobs (tenant, queue_order, queue_id) WHERE held AND state = 'queued';
 CREATE INDEX jobs_offered ON jobs (tenant) WHERE NOT held AND state IN ('queued', 'running');
+CREATE INDEX jobs_of_batch ON jobs (batch_id) WHERE batch_id IS NOT NULL;
 CREATE INDEX jobs_due ON jobs (start_by) WHERE start_by IS NOT NULL AND state IN ('queued', 'running');
 CREATE INDEX jobs_expiry ON jobs (expires_at) WHERE expires_at IS NOT NULL;
 CREATE INDEX jobs_over ON jobs (finished_at) WHERE finished_at IS NOT NULL;
@@ -391,6 +405,7 @@ CREATE TABLE webhooks (
     id text PRIMARY KEY,
     tenant text NOT NULL REFERENCES tenants,
     job_id text REFERENCES jobs ON DELETE CASCADE,  -- gets events of this job only, and is deleted with it
+    batch_id text REFERENCES batches ON DELETE CASCADE,  -- likewise
     url text NOT NULL,
     description text NOT NULL DEFAULT '',
     events text[] NOT NULL,
@@ -404,6 +419,7 @@ CREATE TABLE webhooks (
 );
 CREATE INDEX webhooks_tenant ON webhooks (tenant, created_at DESC, id DESC);
 CREATE INDEX webhooks_job ON webhooks (job_id) WHERE job_id IS NOT NULL;
+CREATE INDEX webhooks_batch ON webhooks (batch_id) WHERE batch_id IS NOT NULL;
 
 CREATE TABLE webhook_deliveries (
     id text PRIMARY KEY,

@@ -189,8 +189,8 @@ CREATE FUNCTION rfc3339(_at timestamptz) RETURNS text LANGUAGE sql STABLE AS $$
     SELECT to_char(_at AT TIME ZONE 'UTC', 'YYYY-MM-DD"T"HH24:MI:SS.US"Z"')
 $$;
 
--- One message for each webhook of the tenant that wants the event; behind 1000 that wait it has failed at once. `_job_id` is none where it is about no job.
-CREATE FUNCTION queue_webhooks(_tenant text, _job_id text, _event text, _at timestamptz, _data jsonb)
+-- One message for each webhook of the tenant that wants the event; behind 1000 that wait it has failed at once. `_about` is the job or batch; none where it is about neither.
+CREATE FUNCTION queue_webhooks(_tenant text, _about text, _event text, _at timestamptz, _data jsonb)
 RETURNS void LANGUAGE plpgsql AS $$
 BEGIN
     INSERT INTO webhook_deliveries (id, webhook_id, event, body, state, finished_at)
@@ -200,7 +200,7 @@ BEGIN
     FROM webhooks AS hook CROSS JOIN LATERAL (SELECT count(*) >= 1000 AS full FROM (
         SELECT FROM webhook_deliveries WHERE webhook_id = hook.id AND state = 'pending' LIMIT 1000) AS first) AS waiting
     WHERE hook.tenant = _tenant AND hook.enabled AND _event = ANY (hook.events)
-        AND (hook.job_id IS NULL OR hook.job_id = _job_id);
+        AND (coalesce(hook.job_id, hook.batch_id) IS NULL OR coalesce(hook.job_id, hook.batch_id) = _about);
     IF FOUND THEN
         PERFORM pg_notify('biresnerf_webhooks', '');
     END IF;
@@ -222,6 +222,40 @@ $$;
 CREATE TRIGGER tell_of_job AFTER INSERT ON job_events FOR EACH ROW
     WHEN (NEW.type IN ('queued', 'started', 'succeeded', 'failed', 'cancelled', 'missed'))
     EXECUTE FUNCTION tell_of_job();
+
+-- The end of a batch is written and told once, whichever of its jobs ends last and however: ends in a tenant's batches
+-- come one after the other, and each sees those before it. The tenant is locked last, as in make_room().
+CREATE FUNCTION close_batch() RETURNS trigger LANGUAGE plpgsql AS $$
+DECLARE
+    _batch batches;
+BEGIN
+    PERFORM 1 FROM tenants WHERE id = NEW.tenant FOR NO KEY UPDATE;
+    UPDATE batches SET finished_at = clock_timestamp() WHERE id = NEW.batch_id AND finished_at IS NULL AND NOT EXISTS (
+        SELECT FROM jobs WHERE batch_id = NEW.batch_id AND state IN ('queued', 'running')) RETURNING * INTO _batch;
+    IF FOUND THEN
+        PERFORM queue_webhooks(_batch.tenant, _batch.id, 'batch.finished', _batch.finished_at, jsonb_build_object(
+            'id', _batch.id, 'created_at', rfc3339(_batch.created_at), 'finished_at', rfc3339(_batch.finished_at),
+            'counts', (SELECT jsonb_object_agg(state, jobs) FROM (
+                SELECT state, count(*) AS jobs FROM jobs WHERE batch_id = _batch.id GROUP BY state) AS counted),
+            'links', jsonb_build_object('self', '/v1/batches/' || _batch.id)));
+    END IF;
+    RETURN NULL;
+END;
+$$;
+CREATE CONSTRAINT TRIGGER close_batch AFTER UPDATE OF state ON jobs DEFERRABLE INITIALLY DEFERRED FOR EACH ROW
+    WHEN (NEW.batch_id IS NOT NULL AND OLD.state IN ('queued', 'running') AND NEW.state NOT IN ('queued', 'running'))
+    EXECUTE FUNCTION close_batch();
+
+-- A batch goes with its last job. Of two that are deleted at once, the second sees that the first is gone.
+CREATE FUNCTION drop_batch() RETURNS trigger LANGUAGE plpgsql AS $$
+BEGIN
+    PERFORM 1 FROM batches WHERE id = OLD.batch_id FOR UPDATE;
+    DELETE FROM batches WHERE id = OLD.batch_id AND NOT EXISTS (SELECT FROM jobs WHERE batch_id = OLD.batch_id);
+    RETURN NULL;
+END;
+$$;
+CREATE TRIGGER drop_batch AFTER DELETE ON jobs FOR EACH ROW WHEN (OLD.batch_id IS NOT NULL)
+    EXECUTE FUNCTION drop_batch();
 
 CREATE FUNCTION tell_of_dataset() RETURNS trigger LANGUAGE plpgsql AS $$
 BEGIN
