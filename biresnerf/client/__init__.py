@@ -9,17 +9,19 @@ Needs the extra ``client``. Answers are the models of `biresnerf.wire`, which th
 """
 
 from biresnerf.client.blocking import Client
-from biresnerf.client.bucket_files import bucket_files
+from biresnerf.client.bucket_files import bucket_files, bucket_target
 from biresnerf.client.client import AsyncClient
 from biresnerf.client.errors import JobFailed, JobNotOver, ServiceError
 from biresnerf.client.events import StreamEvent
 from biresnerf.client.submission import Sending
 from biresnerf.client.uploads import LocalFile
 from biresnerf.wire.datasets import FileAddress
+from biresnerf.wire.deliveries import DeliverTo
 
 __all__ = [
     "AsyncClient",
     "Client",
+    "DeliverTo",
     "FileAddress",
     "JobFailed",
     "JobNotOver",
@@ -28,4 +30,5 @@ __all__ = [
     "ServiceError",
     "StreamEvent",
     "bucket_files",
+    "bucket_target",
 ]

@@ -90,6 +90,7 @@ class Client:
     jobs = _blocking(AsyncClient.jobs)
     wait = _blocking(AsyncClient.wait)
     cancel = _blocking(AsyncClient.cancel)
+    deliver = _blocking(AsyncClient.deliver)
     fork = _blocking(AsyncClient.fork)
     delete_job = _blocking(AsyncClient.delete_job)
     log = _blocking(AsyncClient.log)

@@ -1,4 +1,4 @@
-"""The files of a bucket as addresses that are signed here: no service ever sees the caller's credentials."""
+"""Files of a bucket, and places in it, as addresses that are signed here: no service sees the caller's credentials."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from typing import Any
 
 from biresnerf.errors import InputError
 from biresnerf.wire.datasets import FileAddress
+from biresnerf.wire.deliveries import DeliverTo
 from biresnerf.wire.safe_paths import checked_path, is_litter
 
 SCHEME = "s3://"
-VALID_S = 6 * 3600
+# To read, and to write once a job is over that may have to wait.
+VALID_S, TARGET_VALID_S = 6 * 3600, 24 * 3600
 
 
 def bucket_files(address: str, *, valid_s: int = VALID_S) -> tuple[FileAddress, ...]:
@@ -46,6 +48,20 @@ def bucket_files(address: str, *, valid_s: int = VALID_S) -> tuple[FileAddress, 
     if not found:
         raise InputError("bucket_unreadable", "There are no files.", where=address)
     return found
+
+
+def bucket_target(address: str, *, valid_s: int = TARGET_VALID_S) -> DeliverTo:
+    """Where the service sends a job's files as one zip: ``s3://bucket/name.zip``, or ``result.zip`` below a prefix.
+
+    Raises as `bucket_files` does.
+    """
+    bucket, _, key = address.removeprefix(SCHEME).partition("/")
+    if not key.endswith(".zip"):
+        key = "/".join(filter(None, [key.rstrip("/"), "result.zip"]))
+    with _told(address):
+        asked = {"Bucket": bucket, "Key": key}
+        url = _client(bucket).generate_presigned_url("put_object", Params=asked, ExpiresIn=valid_s)
+    return DeliverTo(archive=url)
 
 
 def _client(bucket: str) -> Any:

@@ -15,6 +15,7 @@ from biresnerf.options.refine_options import RefineOptions, parse_options
 from biresnerf.report import Report
 from biresnerf.wire.base import LABEL_LENGTH, LABELS_MOST
 from biresnerf.wire.batches import BatchView, NewBatch, batch_url
+from biresnerf.wire.deliveries import DeliverTo
 from biresnerf.wire.jobs import (
     CancelJob,
     ForkJob,
@@ -133,6 +134,11 @@ class JobCalls(Transport):
         """All exports of the job, oldest first."""
         return list(parse(await self._ask(Call("GET", f"{job_url(job_id)}/exports")), JobList).items)
 
+    async def deliver(self, job_id: str, to: DeliverTo) -> JobView:
+        """Has files of the job sent to addresses, now or once it is over; ``delivered`` says what became of them."""
+        call = Call("POST", f"{job_url(job_id)}/deliver", json=to.model_dump(mode="json"))
+        return parse(await self._ask(call), JobView)
+
     async def log(self, job_id: str, *, after: int = 0, limit: int = _LOG_LINES) -> list[LogLine]:
         """What the job's process has written, from the line after number ``after``."""
         params: dict[str, str | int] = {"after": after, "limit": limit, "format": "ndjson"}
@@ -175,6 +181,6 @@ def with_name(labels: Mapping[str, str], name: str) -> dict[str, str]:
 
 
 def idempotency_key_of(body: NewJob) -> str:
-    """A key that is the same for the same request, from any process."""
-    asked = json.dumps(body.model_dump(mode="json", exclude_unset=True), sort_keys=True)
+    """A key that is the same for the same request, from any process; signed addresses differ each time."""
+    asked = json.dumps(body.model_dump(mode="json", exclude_unset=True, exclude={"deliver"}), sort_keys=True)
     return hashlib.sha256(asked.encode()).hexdigest()[:32]

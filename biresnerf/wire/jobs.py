@@ -15,6 +15,7 @@ from biresnerf.report import VerdictName
 from biresnerf.stages import ReusableStage, Stage
 from biresnerf.wire.base import NO_CONTROLS, Labels, Links, Page, Record, Time
 from biresnerf.wire.datasets import dataset_url
+from biresnerf.wire.deliveries import DeliveredFile, DeliverTo
 from biresnerf.wire.problems import JobError
 from biresnerf.wire.webhooks import JobWebhook
 
@@ -79,6 +80,7 @@ class JobLinks(Links):
     logs: str
     exports: str
     cancel: str
+    deliver: str
     fork: str
 
 
@@ -151,6 +153,9 @@ class JobView(Record):
         None,
         description="The artifact with a small picture of the result, or of the latest preview while the job runs.",
     )
+    delivered: tuple[DeliveredFile, ...] = Field(
+        (), description="Files that are sent to addresses of the owner's once the job is over."
+    )
     labels: dict[str, str] = Field({}, examples=[{"run": "a"}])
     revision: int = Field(0, examples=[17])
     links: JobLinks = Field(
@@ -196,6 +201,11 @@ class JobTexts(Record):
     webhook: JobWebhook | None = Field(
         None, description="Where messages about this job go, besides all other webhooks."
     )
+    deliver: DeliverTo | None = Field(
+        None,
+        description="Where its files are sent once it is over. A repeated request with the same key keeps the first "
+        "addresses.",
+    )
     priority: PriorityName = Field(
         "normal", description="Before or after other jobs; `high` only where the operator allows it."
     )
@@ -218,6 +228,7 @@ class JobDetails(TypedDict, total=False):
     Attributes:
         priority: before or after other jobs.
         webhook: where messages about it go.
+        deliver: where its files are sent once it is over; see `biresnerf.client.bucket_target`.
         fixed_from: a job with a result of some of the photos: they keep its poses and lenses, others join its frame.
         expires_in_queue_s: seconds from the submission, after which it is not started any more.
         deadline_at: when it is stopped, with its best poses so far.
@@ -225,6 +236,7 @@ class JobDetails(TypedDict, total=False):
 
     priority: PriorityName
     webhook: JobWebhook | None
+    deliver: DeliverTo | None
     fixed_from: str | None
     expires_in_queue_s: int | None
     deadline_at: datetime | None

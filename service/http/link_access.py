@@ -21,8 +21,9 @@ def require_shown(job_id: str, method: str, path: str) -> None:
 
 
 def shown_to_strangers(job: JobView) -> JobView:
-    """The job without its tenant, key, labels, dataset, and the jobs that it was made from."""
+    """The job without its tenant, key, labels, dataset, deliveries, and the jobs that it was made from."""
     links = job.links.model_copy(update={"dataset": ""})
     owners: dict[str, Any] = {"tenant": "", "key_id": None, "labels": {}, "dataset_id": "", "links": links}
+    owners["delivered"] = ()
     others = dict.fromkeys(("parent", "forked_from", "fixed_from", "batch_id"))
     return job.model_copy(update={**owners, **others})

@@ -66,7 +66,7 @@ CATALOGUE: dict[str, tuple[int, str]] = {
     "unsafe_path": (422, "A file name is not safe"),
     "name_collision": (422, "Two file names differ only in case or accents"),
     "archive_rejected": (422, "The archive is not acceptable"),
-    "address_refused": (422, "Files at this address are not fetched"),
+    "address_refused": (422, "Files do not come from or go to this address"),
     "fetch_failed": (422, "The file could not be fetched"),
     "webhook_url_refused": (422, "Webhooks to this address are not allowed"),
     "deadline_refused": (422, "The deadline has passed or is too far ahead"),

@@ -8,6 +8,7 @@ from fastapi import APIRouter, Header, Query, Request
 from fastapi.responses import Response
 from pydantic import AwareDatetime
 
+from biresnerf.wire.deliveries import DeliverTo
 from biresnerf.wire.jobs import CancelJob, JobList, JobState, JobTexts, JobView, NewJob
 from service.http.access import JobWriter, ReadCaller
 from service.http.dependencies import IfNoneMatch, JobId, Paged
@@ -58,7 +59,7 @@ _DISCARD = CancelJob()
         *("bad_idempotency_key", "not_found", "dataset_not_ready", "invalid_options"),
         *("idempotency_key_reused", "archive_rejected", "queue_full", "storage_full", "too_many_uploads"),
         *("webhook_url_refused", "priority_not_allowed", "quota_exhausted", "daily_limit_reached"),
-        "deadline_refused",
+        *("deadline_refused", "address_refused"),
         *("result_not_ready", "state_conflict", "expired"),
     )
     | {200: {"model": JobView, "description": "The job has ended; only with `Prefer: wait`."}},
@@ -159,6 +160,20 @@ async def cancel_job(job_id: JobId, caller: JobWriter, body: CancelJob = _DISCAR
     """Cancels a job, with a partial result if requested. A job that has ended stays as it is."""
     job = await caller.jobs.cancel(job_id, keep_partial=body.keep_partial)
     return job_response(job, status=200 if job.final else 202)
+
+
+@router.post(
+    "/{job_id}/deliver",
+    status_code=202,
+    response_model=JobView,
+    responses=declared("address_refused", "state_conflict", "expired"),
+)
+async def deliver_job(job_id: JobId, caller: JobWriter, body: DeliverTo) -> Response:
+    """Sends files of the job to addresses, by PUT, now or once it is over; `delivered` says what became of them.
+
+    A new address for a file replaces the one before, for example where that has expired.
+    """
+    return job_response(await caller.jobs.deliver(job_id, body), status=202)
 
 
 @router.delete("/{job_id}", status_code=204, responses=declared("state_conflict"))

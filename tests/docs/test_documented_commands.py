@@ -36,6 +36,7 @@ NOT_RUN = {
     "biresnerf compare": "takes hours; tests/studies/commands/test_compare.py runs a small one",
     "biresnerf study": "takes hours; tests/studies/commands/test_compare.py runs a small one",
     "biresnerf up": "the service that all other commands here ask is it, on a free port",
+    "biresnerf submit photos --deliver": "needs a bucket; tests/service/client/test_addresses.py has one",
     "biresnerf submit s3://": "needs a bucket; tests/service/client/test_addresses.py has one",
     "biresnerf restore": "wants an empty installation; tests/workers/upkeep/test_backup.py restores one",
     "biresnerf refine fern_without_poses": "photos from nearly one place, as tests/refinement/start has some",

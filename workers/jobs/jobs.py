@@ -12,6 +12,7 @@ from psycopg.types.json import Jsonb
 
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.wire.base import Page
+from biresnerf.wire.deliveries import DeliverTo
 from biresnerf.wire.jobs import JobDetails, JobEvent, JobState, JobTexts, JobView, LogLine, NewJob
 from workers.database.database import Connection, Database, OwnedStore
 from workers.database.ids import new_id
@@ -20,6 +21,7 @@ from workers.jobs.job_rows import (
     JOB,
     MINE,
     PLACES,
+    add_deliveries,
     asked_columns,
     events_of,
     job_from_row,
@@ -81,7 +83,8 @@ class JobStore(OwnedStore):
         Returns the job and whether it is new (False: the same key with the same request came before).
         Raises `NotFound` (dataset, job), `Conflict` (``dataset_not_ready``, ``idempotency_key_reused``,
         ``priority_not_allowed``, a code of `require_result`), `LimitReached` (``queue_full``, ``quota_exhausted``,
-        ``daily_limit_reached``), `InputError` (``invalid_options``, ``webhook_url_refused``, ``deadline_refused``).
+        ``daily_limit_reached``), `InputError` (``invalid_options``, ``webhook_url_refused``, ``address_refused``,
+        ``deadline_refused``).
         """
         asked = NewJob(dataset_id=dataset_id, options=options, labels=dict(labels or {}), **details)
         columns = asked_columns(options)
@@ -118,6 +121,8 @@ class JobStore(OwnedStore):
         )
         if (hook := asked.webhook) is not None:
             await add_webhook(connection, self._settings, columns["tenant"], hook, hook.events, job_id=job_id)
+        if asked.deliver is not None:
+            await add_deliveries(connection, self._settings, job_id, asked.deliver)
         await queue_job(connection, added)  # an event that the webhook is to get
         return job_id
 
@@ -163,6 +168,21 @@ class JobStore(OwnedStore):
             *newest_first(cursor, limit),
         )
         return page_of(map(job_from_row, rows), limit)
+
+    async def deliver(self, job_id: str, to: DeliverTo) -> JobView:
+        """Have files of the job sent, now or once it is over; a new address replaces the one before.
+
+        Raises `NotFound`, `Expired`, `Conflict` (``state_conflict``: an export), `InputError` (``address_refused``).
+        """
+        async with self._database.transaction() as connection:
+            await connection.execute("SELECT 1 FROM jobs WHERE id = %s FOR NO KEY UPDATE", (job_id,))
+            row = await self._required(connection, job_id)
+            if row["kind"] != "refine":
+                raise Conflict("state_conflict", f"{job_id} is an export; its files are those of its parent.")
+            if row["state"] == "expired":
+                raise Expired(f"The files of job {job_id} were kept for their time and are gone.")
+            await add_deliveries(connection, self._settings, job_id, to)
+            return job_from_row(await self._required(connection, job_id))
 
     async def cancel(self, job_id: str, *, keep_partial: bool = False) -> JobView:
         """Ask for the end of a job: a queued one is cancelled at once, a running one within seconds.

@@ -1,4 +1,4 @@
-"""The dispatcher: a small process that sends webhooks, fetches files, and expires results and datasets.
+"""The dispatcher: a small process that sends webhooks, fetches and delivers files, and expires results and datasets.
 
 Several may run at the same time, on any hosts: each message and file is claimed by one of them. Jobs need none of them;
 while no dispatcher runs, messages and files wait.
@@ -14,12 +14,15 @@ import sys
 from workers.database.database import open_database
 from workers.database.notifications import Listener
 from workers.datasets.fetcher import Fetcher
+from workers.jobs.job_updates import JobListener
+from workers.jobs.jobs import JobStore
 from workers.process.exit_status import ExitStatus
 from workers.process.waiting import first_done
 from workers.process.watchdog import end_if_broken, run_process
 from workers.settings.settings import Settings
 from workers.store.files import open_files
 from workers.store.store_identity import require_same_store
+from workers.upkeep.deliverer import Deliverer
 from workers.upkeep.expiry import Expiry
 from workers.webhooks.outbound import Outbound, Policy
 from workers.webhooks.webhook_sender import WebhookSender
@@ -41,8 +44,11 @@ async def dispatch(settings: Settings, stop: asyncio.Event) -> None:
         listener = Listener(database, settings.poll_s, WEBHOOK_CHANNEL)
         listening = asyncio.create_task(listener.run())
         sender = WebhookSender(database, listener, Outbound(Policy.of(settings)), settings)
-        fetcher = Fetcher(database, files, listener, Outbound(Policy.of_files(settings)), settings)
-        duties = (sender, fetcher, Expiry(database, settings))
+        to_files = Outbound(Policy.of_files(settings))
+        jobs = JobStore(database, JobListener(database, settings.poll_s), settings)
+        fetcher = Fetcher(database, files, listener, to_files, settings)
+        deliverer = Deliverer(jobs, database, files, listener, to_files, settings)
+        duties = (sender, fetcher, deliverer, Expiry(database, settings))
         working = [asyncio.create_task(duty.run(stop)) for duty in duties]
         try:
             log.info("dispatcher is ready")

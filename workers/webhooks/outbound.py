@@ -1,8 +1,8 @@
-"""All outgoing requests, to addresses given by users: POST of messages, GET of files; protected against forgery (SSRF).
+"""All outgoing requests, to addresses of users: POST of messages, GET and PUT of files; safe from forgery (SSRF).
 
 The host name is resolved once, all its addresses are checked, and the connection uses a checked address; TLS and
-the Host header keep the name. Redirects of a POST are not followed, and its response body is not read. Those of a GET
-are: each new address is checked like the first.
+the Host header keep the name. Redirects of a GET alone are followed, each new address is checked like the first, and
+its response body alone is read.
 """
 
 from __future__ import annotations
@@ -234,6 +234,23 @@ class Outbound:
             after = _headers(response).get("retry-after")
             return Answer(response.status, after)
 
+    async def put(
+        self,
+        address: str,
+        size: int,
+        chunks: AsyncIterator[bytes],
+        headers: Mapping[str, str],
+        *,
+        timeout_s: float,
+    ) -> Answer:
+        """PUT ``size`` bytes, as `post` does."""
+        length = {"Content-Length": str(size)}
+        async with (
+            asyncio.timeout(timeout_s),
+            self._sent("PUT", address, {**headers, **length}, chunks) as response,
+        ):
+            return Answer(response.status, _headers(response).get("retry-after"))
+
     @asynccontextmanager
     async def get(
         self, address: str, headers: Mapping[str, str], *, head_s: float, idle_s: float
@@ -259,7 +276,11 @@ class Outbound:
 
     @asynccontextmanager
     async def _sent(
-        self, method: str, address: str, headers: Mapping[str, str], body: bytes | None = None
+        self,
+        method: str,
+        address: str,
+        headers: Mapping[str, str],
+        body: bytes | AsyncIterator[bytes] | None = None,
     ) -> AsyncIterator[httpcore.Response]:
         try:
             url = checked_url(address, self._policy)

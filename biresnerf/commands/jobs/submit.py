@@ -94,6 +94,11 @@ class _SetParameter(click.ParamType):
     metavar="JOB",
     help="A job with a result of some of the photos: they keep its poses and lenses, and the others join its frame.",
 )
+@click.option(
+    "--deliver",
+    metavar="S3",
+    help="s3://bucket/prefix, or .../name.zip: the service sends the files there as a zip once the job is over.",
+)
 @click.option("--resume", metavar="DATASET", help="Resume an interrupted submission with its dataset.")
 @service_options
 @json_option
@@ -108,6 +113,7 @@ def submit_command(
     url: str | None,
     api_key: str | None,
     as_json: bool,
+    deliver: str | None,
     **how: Any,
 ) -> None:
     """Submit PATH to a service as a job.
@@ -125,6 +131,10 @@ def submit_command(
     if output is not None:
         require_empty(output)
     with service_at(url, api_key) as client:
+        if deliver is not None:
+            from biresnerf.client import bucket_target
+
+            how["deliver"] = bucket_target(deliver)
         job = submitted(
             client, path, options, **{key: value for key, value in how.items() if value is not None}
         )

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import os
 import subprocess
 import sys
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
@@ -12,9 +14,9 @@ from urllib.parse import parse_qs, urlsplit
 import httpx
 import pytest
 
-from biresnerf.client import Client, FileAddress, ServiceError, bucket_files
+from biresnerf.client import Client, FileAddress, ServiceError, bucket_files, bucket_target
 from biresnerf.errors import InputError
-from tests.service.conftest import Running, dataset_ids, scene_files, zip_of
+from tests.service.conftest import Running, dataset_ids, problem, scene_files, until, zip_of
 from tests.workers.buckets import by_boto, fresh_bucket, moto_server
 from workers.store.file_places import Bucket
 
@@ -115,3 +117,38 @@ def test_an_address_that_leads_to_nothing_fails_by_name_and_leaves_no_dataset(
         client.submit_addresses([good, bad], FAST)
     assert (told.value.code, told.value.where) == ("fetch_failed", "gone.jpg")
     assert dataset_ids(http) == before
+
+
+def test_the_command_has_the_result_sent_into_the_callers_bucket(
+    http: httpx.Client, service: Running, scene: Path, bucket: Bucket
+) -> None:
+    command = [sys.executable, "-m", "biresnerf.command_line", "submit", str(scene), "--preset", "fast"]
+    done = subprocess.run(
+        [*command, "--set", "steps=20", "--set", "seed=5", "--deliver", f"s3://{bucket.name}/results/"],
+        env={**os.environ, "BIRESNERF_URL": service.url},
+        capture_output=True,
+        text=True,
+        timeout=90,
+    )
+    assert done.returncode == 0, done.stderr
+    job = done.stdout.split()[0].rpartition("/")[2]
+    found = until(http, job, lambda now: now["delivered"][0]["state"] != "waiting")
+    assert (found["state"], found["delivered"][0]["error"]) == ("succeeded", None)
+    sent = by_boto(bucket).get_object(Bucket=bucket.name, Key="results/result.zip")
+    assert sent["ContentType"] == "application/zip"
+    with zipfile.ZipFile(io.BytesIO(sent["Body"].read())) as archive:
+        items = {item["name"]: item for item in http.get(f"/v1/jobs/{job}/artifacts").json()["items"]}
+        assert {name: len(archive.read(name)) for name in archive.namelist()} == {
+            name: item["size"] for name, item in items.items()
+        }
+    assert "X-Amz-Signature" not in http.get(f"/v1/jobs/{job}").text + service.log.read_text()
+    link = http.post(f"/v1/jobs/{job}/links", json={}).json()["token"]
+    seen = http.get(f"/v1/jobs/{job}", headers={"Authorization": f"Bearer {link}"}).json()
+    assert seen["delivered"] == []
+    ((_, target),) = bucket_target(f"s3://{bucket.name}/again.zip", valid_s=60).addresses
+    again = http.post(f"/v1/jobs/{job}/deliver", json={"files": {"report.json": target}})
+    assert (again.status_code, len(again.json()["delivered"])) == (202, 2)
+    until(http, job, lambda now: {item["state"] for item in now["delivered"]} == {"delivered"})
+    refused = http.post(f"/v1/jobs/{job}/deliver", json={"archive": "http://169.254.169.254/?SECRET"})
+    assert "SECRET" not in problem(refused, 422, "address_refused")["detail"]
+    problem(http.post(f"/v1/jobs/{job}/deliver", json={}), 422, "invalid_request")

@@ -30,6 +30,7 @@ from workers.tenants.api_keys import ALL_SCOPES
 # Of routes that look at the body first.
 BODIES: dict[str, dict[str, Any]] = {
     "/v1/jobs/{job_id}/exports": {"formats": ["kitti"]},
+    "/v1/jobs/{job_id}/deliver": {"archive": "https://a.example/a.zip"},
     "/v1/jobs/{job_id}/shares": {"name": "report.json"},
     "/v1/datasets/{dataset_id}/fetches": {"files": [{"url": "https://a.example/a.zip"}]},
     "/v1/datasets/{dataset_id}/signed-uploads": {"files": [{"path": "a", "size": 1, "sha256": 64 * "0"}]},

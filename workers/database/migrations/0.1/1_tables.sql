@@ -228,6 +228,7 @@ CREATE TABLE jobs (
     reusable jsonb NOT NULL DEFAULT '{}',
     previews jsonb,
     artifacts jsonb NOT NULL DEFAULT '[]',
+    delivered jsonb NOT NULL DEFAULT '[]',
     stored_bytes bigint GENERATED ALWAYS AS (bytes_of_artifacts(artifacts)) STORED,
     log_lines bigint NOT NULL DEFAULT 0,
     trace text,
@@ -272,6 +273,21 @@ CREATE INDEX jobs_labels ON jobs USING gin (labels jsonb_path_ops);
 -- Of two exports of one result in the same formats, the second is the first.
 CREATE UNIQUE INDEX jobs_one_export ON jobs (parent, fingerprint)
     WHERE kind = 'export' AND state IN ('queued', 'running', 'succeeded');
+
+-- Files of a job that a dispatcher is to send once it is over; `jobs.delivered` says what became of them. `name`: none
+-- for a zip of all. `url` is a secret: the row goes once the file was sent or will not be. The others: `upload_fetches`.
+CREATE TABLE job_deliveries (
+    id text PRIMARY KEY,
+    job_id text NOT NULL REFERENCES jobs ON DELETE CASCADE,
+    name text,
+    url text NOT NULL,
+    round int NOT NULL DEFAULT 0,
+    due_at timestamptz NOT NULL DEFAULT clock_timestamp(),
+    token uuid,
+    leased_until timestamptz,
+    losses int NOT NULL DEFAULT 0
+);
+CREATE INDEX job_deliveries_job ON job_deliveries (job_id);
 
 -- What is asked of jobs from outside of workers/jobs.
 CREATE VIEW job_counts AS

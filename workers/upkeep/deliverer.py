@@ -1,0 +1,152 @@
+"""Sends files of jobs that are over to addresses of their owners': a dispatcher's work, like the webhooks.
+
+Addresses are secrets: no log and no error contains more of them than the host.
+"""
+
+from __future__ import annotations
+
+import logging
+import zipfile
+from collections.abc import AsyncIterator, Sequence
+from typing import Any
+from urllib.parse import urlsplit
+
+from biresnerf import __version__
+from biresnerf.wire.problems import JobError
+from workers.database.claimed_work import LeasedWork
+from workers.database.database import Database
+from workers.database.notifications import Listener
+from workers.jobs.job_rows import note_delivery
+from workers.jobs.jobs import JobStore
+from workers.records import Artifact
+from workers.settings.errors import Expired, NotFound, Unavailable
+from workers.settings.settings import Settings
+from workers.store.files import FileStore
+from workers.webhooks.outbound import TROUBLES, Outbound
+from workers.webhooks.transfers import SLOW_S, SLOWEST_BYTES_PER_S, TransferFailed
+from workers.webhooks.webhook_sender import ROUNDS_MAX, pause
+
+log = logging.getLogger(__name__)
+
+LOSSES_MAX = 2
+# Stores take no more in one request, and larger zips are of a form that some programs cannot read.
+ZIP_BYTES_MAX = 2**31 - 1
+
+
+class Deliverer(LeasedWork):
+    """Runs in every dispatcher; several may."""
+
+    at_once, per_tenant = 8, 4
+    table = "job_deliveries"
+    owners = "JOIN jobs ON jobs.id = work.job_id WHERE jobs.state NOT IN ('queued', 'running')"
+
+    def __init__(
+        self,
+        jobs: JobStore,
+        database: Database,
+        files: FileStore,
+        listener: Listener,
+        outbound: Outbound,
+        settings: Settings,
+    ) -> None:
+        super().__init__(database, listener, settings.poll_s, 2 * settings.beat_s)
+        self._jobs, self._files, self._outbound, self._settings = jobs, files, outbound, settings
+
+    async def _do(self, row: dict[str, Any]) -> None:
+        failed = await self._attempt(row)
+        round_ = row["round"] + 1
+        if failed is not None and failed.again and round_ < ROUNDS_MAX:
+            wait_s = max(pause(round_, self._settings.webhook_retry_s), failed.wait_s)
+            await self._give_back(row, round_=round_, wait_s=wait_s)
+            return
+        host = urlsplit(row["url"]).hostname or ""
+        error = (
+            None if failed is None else failed.error(host, row["name"] or "archive", code="delivery_failed")
+        )
+        await self._conclude(row, host, error)
+
+    async def _attempt(self, row: dict[str, Any]) -> TransferFailed | None:
+        if row["losses"] >= LOSSES_MAX:
+            return TransferFailed(f"was given up: {LOSSES_MAX} processes were lost while they sent to it")
+        try:
+            await self._send(row)
+        except Unavailable:
+            raise
+        except TransferFailed as failed:
+            return failed
+        except (Expired, NotFound) as error:
+            return TransferFailed(error.detail, code=error.code)
+        except TROUBLES as trouble:
+            return TransferFailed.of_trouble(trouble)
+        except Exception:  # a fault of ours must not repeat without end
+            log.exception("a file of %s could not be sent", row["job_id"])
+            return TransferFailed("was sent nothing, by a fault of the service", again=True)
+        return None
+
+    async def _send(self, row: dict[str, Any]) -> None:
+        found = await self._jobs.artifacts(row["job_id"])
+        if row["name"] is None:
+            size, chunks, kind = zip_bytes(found), zipped(self._files, found), "application/zip"
+            if size > ZIP_BYTES_MAX:
+                raise TransferFailed(
+                    f"The zip would have {size} bytes; have single files sent.", code="body_too_large"
+                )
+        else:
+            artifact = next((item for item in found if item.name == row["name"]), None)
+            if artifact is None:
+                raise TransferFailed("The job has no file of this name.", code="not_found")
+            size, chunks, kind = artifact.size, self._files.read(artifact.key), artifact.media_type
+        headers = {"User-Agent": f"BiResNeRF/{__version__}", "Content-Type": kind}
+        limit_s = SLOW_S + size / SLOWEST_BYTES_PER_S
+        answer = await self._outbound.put(row["url"], size, chunks, headers, timeout_s=limit_s)
+        if not 200 <= answer.status < 300:
+            raise TransferFailed.of_answer(answer.status, {"retry-after": answer.retry_after or ""})
+
+    async def _conclude(self, row: dict[str, Any], host: str, error: JobError | None) -> None:
+        if error is not None:
+            log.info("a file of %s is not delivered: %s", row["job_id"], error)
+        async with self._database.transaction() as connection:
+            # The job first, then its deliveries: who deletes it locks them in this order.
+            await connection.execute("SELECT 1 FROM jobs WHERE id = %s FOR NO KEY UPDATE", (row["job_id"],))
+            if await self._forget(connection, row["id"]):
+                await note_delivery(connection, row["job_id"], row["name"], host, error)
+
+
+class _Written:
+    """Takes what a zip file writes; having no places, it makes the zip one that is written in one go."""
+
+    def __init__(self) -> None:
+        self._parts: list[bytes] = []
+
+    def write(self, part: bytes) -> int:
+        self._parts.append(bytes(part))
+        return len(part)
+
+    def flush(self) -> None:
+        """Nothing is held back."""
+
+    def taken(self) -> bytes:
+        """What was written since the last call."""
+        parts, self._parts = self._parts, []
+        return b"".join(parts)
+
+
+def zip_bytes(artifacts: Sequence[Artifact]) -> int:
+    """The size of the zip of these files: of one of empty files with the same names, and their contents."""
+    written = _Written()
+    with zipfile.ZipFile(written, "w") as archive:  # type: ignore[call-overload]
+        for artifact in artifacts:
+            archive.open(zipfile.ZipInfo(artifact.name), "w").close()
+    return len(written.taken()) + sum(artifact.size for artifact in artifacts)
+
+
+async def zipped(files: FileStore, artifacts: Sequence[Artifact]) -> AsyncIterator[bytes]:
+    """The zip of these files, not compressed, so that its size is known before."""
+    written = _Written()
+    with zipfile.ZipFile(written, "w") as archive:  # type: ignore[call-overload]
+        for artifact in artifacts:
+            with archive.open(zipfile.ZipInfo(artifact.name), "w") as entry:
+                async for chunk in files.read(artifact.key):
+                    entry.write(chunk)
+                    yield written.taken()
+    yield written.taken()
