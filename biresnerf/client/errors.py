@@ -96,7 +96,7 @@ class ServiceError(FaultError):
 
 
 class JobFailed(BiresnerfError):
-    """The job failed, was cancelled, missed its deadline or has expired; ``job`` is its final state."""
+    """The job failed, was cancelled or has expired; ``job`` is its final state."""
 
     def __init__(self, job: JobView) -> None:
         self.job = job

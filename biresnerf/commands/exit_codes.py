@@ -10,7 +10,7 @@ import click
 DONE = 0
 FAILED = 1  # none of the others: the optimisation diverged, a bug
 INPUT = 2  # the input, an option, or the usage has to change
-JOB = 3  # the job failed, was cancelled, missed its deadline, or has expired
+JOB = 3  # the job failed, was cancelled, or has expired
 NOT_FOUND = 4  # no such job, dataset or file
 KEY = 5  # the API key is missing, refused, or lacks the permission
 AWAY = 6  # the service cannot be reached, or is busy

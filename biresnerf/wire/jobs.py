@@ -19,8 +19,8 @@ from biresnerf.wire.deliveries import DeliveredFile, DeliverTo
 from biresnerf.wire.problems import JobError
 from biresnerf.wire.webhooks import JobWebhook
 
-JobState = Literal["queued", "running", "succeeded", "failed", "cancelled", "missed", "expired"]
-FINAL_JOB_STATES: frozenset[JobState] = frozenset({"succeeded", "failed", "cancelled", "missed", "expired"})
+JobState = Literal["queued", "running", "succeeded", "failed", "cancelled", "expired"]
+FINAL_JOB_STATES: frozenset[JobState] = frozenset({"succeeded", "failed", "cancelled", "expired"})
 PriorityName = Literal["low", "normal", "high"]
 JobKind = Literal["refine", "export"]
 
@@ -37,8 +37,8 @@ EventType = Literal[
     "succeeded",
     "failed",
     "cancelled",
-    "missed",
     "expired",
+    "files_expired",
 ]
 WantedStage = Literal["auto", "seeding", "coarse"]
 DEADLINE_MOST_S = 30 * 86_400  # the latest deadline, from the submission
@@ -116,7 +116,7 @@ class JobView(Record):
     cancel_requested: bool = False
     created_at: datetime
     start_by: datetime | None = Field(
-        None, description="If it has not started by then, it ends as `missed`; null if it may wait."
+        None, description="If it has not started by then, it ends as `expired`; null if it may wait."
     )
     deadline_at: datetime | None = Field(
         None, description="If it runs then, it is stopped, and keeps its best poses so far."
@@ -213,12 +213,12 @@ class JobTexts(Record):
         None,
         ge=1,
         le=DEADLINE_MOST_S,
-        description="Seconds from the submission. If the job has not started by then, it ends as `missed`.",
+        description="Seconds from the submission. If the job has not started by then, it ends as `expired`.",
     )
     deadline_at: Time | None = Field(
         None,
         description="A time with an offset, at most 30 days ahead. If the job has not started by then, it ends as "
-        "`missed`; if it has, it is stopped, and keeps its best poses so far.",
+        "`expired`; if it has, it is stopped, and keeps its best poses so far.",
     )
 
 

@@ -19,7 +19,7 @@ WebhookEvent = Literal[
     "job.succeeded",
     "job.failed",
     "job.cancelled",
-    "job.missed",
+    "job.expired",
     "batch.finished",
     "dataset.validated",
 ]
@@ -143,7 +143,7 @@ class JobWebhook(BatchWebhook):
     """A webhook for one job, part of its request. The client chooses the secret."""
 
     events: tuple[WebhookEvent, ...] = Field(
-        ("job.succeeded", "job.failed", "job.cancelled", "job.missed"),
+        ("job.succeeded", "job.failed", "job.cancelled", "job.expired"),
         min_length=1,
         max_length=len(ALL_EVENTS),
     )

@@ -28,7 +28,7 @@ _STREAM: dict[int | str, dict[str, Any]] = {
     200: {
         "description": (
             "Events `queued`, `started`, `stage`, `checkpoint`, `preview`, `attempt_crashed`, "
-            "`retried_smaller`, `requeued`, `cancel_requested`, `succeeded`, `failed`, `cancelled`, `missed` have an "
+            "`retried_smaller`, `requeued`, `cancel_requested`, `succeeded`, `failed`, `cancelled`, `expired` have an "
             "`id` and are never lost; `progress` contains the current job, at most once a second. "
             "Comments keep the connection alive. The stream ends when the job does."
         ),

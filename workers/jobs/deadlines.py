@@ -61,7 +61,7 @@ async def end_overdue_jobs(connection: Connection, stall_s: float) -> list[str]:
 async def end_overdue(connection: Connection, job: Mapping[str, Any], stall_s: float) -> None:
     """End an unfinished job beyond its time, whose row the caller has locked.
 
-    One that never started ends as missed. Any other one is stopped as on request, and keeps its best poses so far, if
+    One that never started ends as expired. Any other one is stopped as on request, and keeps its best poses so far, if
     it has shown any: a running one by its worker, one that waits again for a worker at once.
     """
     if job["started_at"] is None:
@@ -69,7 +69,7 @@ async def end_overdue(connection: Connection, job: Mapping[str, Any], stall_s: f
         late = f"The job had not started by {_written(job['start_by'])}."
         hint = "Submit it again with more time, or when fewer jobs wait."
         await finish(
-            connection, job["id"], "missed", JobError(code="deadline_passed", detail=late, hint=hint)
+            connection, job["id"], "expired", JobError(code="deadline_passed", detail=late, hint=hint)
         )
         return
     late = f"The job was stopped at its deadline, {_written(job['deadline_at'])}."

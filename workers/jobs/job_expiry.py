@@ -52,7 +52,7 @@ async def expire_jobs(connection: Connection, limit: int) -> int:
     """Expire the results that are due, at most ``limit``; returns how many."""
     due = await connection.rows(
         "SELECT id, tenant, finished_at, artifacts FROM jobs WHERE expires_at <= now()"
-        " AND state IN ('succeeded', 'failed', 'cancelled', 'missed')"
+        " AND state IN ('succeeded', 'failed', 'cancelled')"
         # An unfinished export, fork or job that joins it still reads the files.
         " AND NOT EXISTS (SELECT 1 FROM jobs AS export WHERE export.parent = jobs.id"
         " AND export.state IN ('queued', 'running'))"
@@ -70,7 +70,7 @@ async def expire_jobs(connection: Connection, limit: int) -> int:
             " reusable = '{}' WHERE id = %s",
             (job["id"],),
         )
-        await add_event(connection, job["id"], "expired", freed)
+        await add_event(connection, job["id"], "files_expired", freed)
         await discard(connection, f"jobs/{job['id']}")
         over = f"{job['finished_at']:%Y-%m-%d %H:%M} UTC"
         log.info("expired %s of %s, over since %s: %s", job["id"], job["tenant"], over, freed)

@@ -48,12 +48,17 @@ def job_from_row(row: dict[str, Any]) -> JobView:
     )
 
 
+def require_files(row: Mapping[str, Any]) -> None:
+    """Raises `Expired` for a job whose files are gone. One that had not started in time never had any."""
+    if row["state"] == "expired" and row["started_at"] is not None:
+        raise Expired(f"The files of job {row['id']} were kept for their time and are gone.")
+
+
 def require_result(row: Mapping[str, Any]) -> None:
     """Raises `Expired` or `Conflict` (``result_not_ready``, ``state_conflict``) for a job without all its poses."""
     if row["kind"] != "refine":
         raise Conflict("state_conflict", f"{row['id']} is an export itself.")
-    if row["state"] == "expired":
-        raise Expired(f"The files of job {row['id']} were kept for their time and are gone.")
+    require_files(row)
     if row["state"] in ("queued", "running"):
         raise Conflict("result_not_ready", f"The job is {row['state']}.")
     names = {item["name"] for item in row["artifacts"]}

@@ -26,7 +26,7 @@ from workers.store.trash import discard
 
 log = logging.getLogger(__name__)
 
-End = Literal["succeeded", "failed", "cancelled", "missed"]
+End = Literal["succeeded", "failed", "cancelled", "expired"]
 
 
 async def add_event(
@@ -225,10 +225,11 @@ async def finish(
     await connection.execute(
         "UPDATE jobs SET state = %s, error = %s, artifacts = %s, finished_at = clock_timestamp(),"
         " eta_s = NULL, fraction = CASE WHEN %s = 'succeeded' THEN 1 ELSE fraction END,"
+        " expires_at = CASE WHEN %s = 'expired' THEN clock_timestamp() ELSE expires_at END,"
         " partial = %s, previews = NULL, checkpoint = NULL WHERE id = %s",
         (
             *(state, _error_column(error)),
-            *(Jsonb([item.model_dump() for item in artifacts]), state, partial, job_id),
+            *(Jsonb([item.model_dump() for item in artifacts]), state, state, partial, job_id),
         ),
     )
     data: dict[str, Any] = {"code": error.code, "detail": error.detail} if error else {}

@@ -26,6 +26,7 @@ from workers.jobs.job_rows import (
     events_of,
     job_from_row,
     known_job,
+    require_files,
     require_result,
     submission_fingerprint,
 )
@@ -41,7 +42,7 @@ from workers.records import (
     newest_first,
     page_of,
 )
-from workers.settings.errors import Conflict, Expired
+from workers.settings.errors import Conflict
 from workers.settings.settings import Settings
 from workers.settings.traces import traced
 from workers.tenants.tenants import LOCAL_TENANT
@@ -224,8 +225,7 @@ class JobStore(OwnedStore):
         """
         async with self._database.transaction() as connection:
             own = await self._required(connection, job_id)
-            if own["state"] == "expired":
-                raise Expired(f"The files of job {job_id} were kept for their time and are gone.")
+            require_files(own)
             exports = await connection.rows(
                 "SELECT artifacts FROM jobs WHERE parent = %s AND state = 'succeeded'", job_id
             )

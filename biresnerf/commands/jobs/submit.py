@@ -78,14 +78,14 @@ class _SetParameter(click.ParamType):
     "expires_in_queue_s",
     type=click.IntRange(1, DEADLINE_MOST_S),
     metavar="SECONDS",
-    help="End the job as missed if it has not started after this time.",
+    help="End the job as expired if it has not started after this time.",
 )
 @click.option(
     "--deadline",
     "deadline_at",
     callback=_time,
     metavar="TIME",
-    help="Stop the job then, with its best poses so far; as missed if it has not started. Local time, unless it says "
+    help="Stop the job then, with its best poses so far; as expired if it has not started. Local time, unless it says "
     "otherwise.",
 )
 @label_option

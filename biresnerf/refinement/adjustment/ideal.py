@@ -47,8 +47,9 @@ def straight_photo(
 
     Bilinear. Both intrinsics are for the photo's size.
     """
-    last = torch.tensor([photo.shape[1] - 1, photo.shape[0] - 1], dtype=torch.float64)
-    source = _seen_at(*photo.shape[:2], image, intrinsics, ideal)
+    height, width = photo.shape[:2]
+    last = torch.tensor([width - 1, height - 1], dtype=torch.float64)
+    source = _seen_at(height, width, image, intrinsics, ideal)
     seen = ((source >= 0) & (source <= last)).all(2)  # no NaN is
     at = torch.where(seen[..., None], source / last.clamp(min=1) * 2 - 1, -1.0).float()
     picture = torch.from_numpy(photo).permute(2, 0, 1)

@@ -31,7 +31,7 @@ export async function followJob(jobId: string, handlers: JobEventHandlers, signa
     }
     const event = message as JobEvent;
     last = event.seq;
-    over ||= ["succeeded", "failed", "cancelled", "missed", "expired"].includes(event.type);
+    over ||= ["succeeded", "failed", "cancelled", "expired"].includes(event.type);
     handlers.onEvent(event);
   };
   while (!over && !signal.aborted) {

@@ -7,7 +7,7 @@ export function Failure({ job, images }: { job: JobView; images: readonly string
   const { error } = job;
   if (job.partial && job.state !== "expired") return null; // the verdict says so
   const gone = WITHOUT_RESULT[job.state];
-  if (gone && (!error || job.state === "expired")) {
+  if (gone && (!error || (job.state === "expired" && job.started_at))) {
     return (
       <section class="card">
         <h2>{gone.title}</h2>

@@ -114,7 +114,7 @@ export class LiveJob extends Store<LiveState> {
     this.change({ events: [...this.value.events, event] });
     // Old events are replayed on connecting; the files were loaded once already.
     const fresh = !this.complete && Date.now() - Date.parse(event.at) < 60_000;
-    if (fresh && ["preview", "succeeded", "cancelled", "failed", "missed"].includes(event.type)) void this.refresh();
+    if (fresh && ["preview", "succeeded", "cancelled", "failed", "expired"].includes(event.type)) void this.refresh();
   };
 
   private async load(): Promise<void> {

@@ -30,7 +30,6 @@ export const STATE_WORDS = {
   succeeded: "done",
   failed: "failed",
   cancelled: "cancelled",
-  missed: "missed",
   expired: "expired",
 } as const;
 

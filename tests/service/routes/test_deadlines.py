@@ -21,30 +21,28 @@ def over(job: dict[str, Any]) -> bool:
     return job["finished_at"] is not None
 
 
-def test_a_job_that_waits_too_long_is_missed_and_its_follower_is_told(
-    http: httpx.Client, scene: Path
-) -> None:
+def test_a_job_that_waits_too_long_expires_and_its_follower_is_told(http: httpx.Client, scene: Path) -> None:
     dataset = ready_dataset(http, scene)
     running = submit(http, dataset, steps=4000, step_ms=20)["id"]
     until(http, running, lambda job: job["state"] == "running")
     body = {"dataset_id": dataset, "options": FAST, "expires_in_queue_s": 1}
     answer = http.post("/v1/jobs", json=body, headers={"Prefer": "wait=30"})
     job = answer.json()
-    assert (answer.status_code, job["state"]) == (200, "missed")
+    assert (answer.status_code, job["state"]) == (200, "expired")
     assert job["error"]["code"] == "deadline_passed"
     assert job["started_at"] is None
     told = http.get(job["links"]["events"]).text
     assert [line for line in told.splitlines() if line.startswith("event: ")] == [
         "event: queued",
         "event: progress",
-        "event: missed",
+        "event: expired",
     ]
-    assert job["id"] in [item["id"] for item in http.get("/v1/jobs?state=missed").json()["items"]]
+    assert job["id"] in [item["id"] for item in http.get("/v1/jobs?state=expired").json()["items"]]
     assert http.get(job["links"]["artifacts"]).json()["items"] == []
     problem(http.get(job["links"]["report"]), 404, "not_found")
     problem(http.post(job["links"]["fork"], json={}), 409, "fork_not_possible")
     problem(http.post(job["links"]["exports"], json={"formats": ["kitti"]}), 409, "state_conflict")
-    assert http.post(job["links"]["cancel"]).json()["state"] == "missed"
+    assert http.post(job["links"]["cancel"]).json()["state"] == "expired"
     assert http.delete(job["links"]["self"]).status_code == 204
     http.post(f"/v1/jobs/{running}/cancel")
     until(http, running, over)
@@ -57,7 +55,7 @@ def test_a_job_is_stopped_at_its_deadline_and_keeps_what_it_has(
     options = '{"preset": "fast", "steps": 4000, "seed": 20}'
     dataset = "" if form else ready_dataset(http, scene)
     archive = zip_of(scene_files(scene))
-    deadline = later(6)
+    deadline = later(12)
     if form:
         texts = {"options": options, "deadline_at": deadline, "expires_in_queue_s": "60"}
         answer = http.post("/v1/jobs", files={"archive": ("a.zip", archive)}, data=texts)

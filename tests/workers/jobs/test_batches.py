@@ -170,7 +170,7 @@ async def _crashes_too_often(stores: Stores, job_id: str) -> None:
     assert await claimed(database, job_id) is None
 
 
-async def _is_missed(stores: Stores, job_id: str) -> None:
+async def _expires(stores: Stores, job_id: str) -> None:
     late = "UPDATE jobs SET start_by = now() - interval '1 minute' WHERE id = %s RETURNING id"
     await stores.jobs._database.fetch(late, job_id)
     await stores.jobs._database.run(end_overdue_jobs, STALL_S)
@@ -184,9 +184,9 @@ async def _is_missed(stores: Stores, job_id: str) -> None:
         (_is_cancelled, "cancelled"),
         (_is_lost_after_its_cancel, "cancelled"),
         (_crashes_too_often, "failed"),
-        (_is_missed, "missed"),
+        (_expires, "expired"),
     ],
-    ids=["succeeds", "fails", "is_cancelled", "is_lost", "crashes", "is_missed"],
+    ids=["succeeds", "fails", "is_cancelled", "is_lost", "crashes", "expires"],
 )
 async def test_the_end_of_a_batch_is_told_once_however_its_last_job_ends(
     stores: Stores,
@@ -254,7 +254,7 @@ async def test_jobs_that_end_in_one_transaction_or_in_many_at_once_are_told_once
     late = "UPDATE jobs SET start_by = now() - interval '1 minute' WHERE batch_id = %s RETURNING id"
     await stores.jobs._database.fetch(late, made[0].id)
     await stores.jobs._database.run(end_overdue_jobs, STALL_S)
-    assert [data["counts"] for data in await told(stores, hook)] == [{"missed": 4}]
+    assert [data["counts"] for data in await told(stores, hook)] == [{"expired": 4}]
     clients = [stores.jobs.cancel(job.id) for batch in made[1:] for job in batch.jobs]
     await asyncio.gather(*clients, batches.cancel_batch(made[2].id))
     assert sorted(data["id"] for data in await told(stores, hook)) == sorted(batch.id for batch in made)

@@ -45,7 +45,7 @@ def stopped_at_its_deadline(job: JobView) -> bool:
     return job.state == "cancelled" and job.error is not None and job.error.code == "deadline_passed"
 
 
-async def test_a_job_that_waits_too_long_ends_missed_and_never_runs(
+async def test_a_job_that_waits_too_long_expires_and_never_runs(
     counting: Counting, settings: Settings, slots: Slots
 ):
     slots.start(settings, "a")
@@ -56,19 +56,19 @@ async def test_a_job_that_waits_too_long_ends_missed_and_never_runs(
     assert asked.start_by is not None
     assert timedelta(seconds=0.9) < asked.start_by - asked.created_at < timedelta(seconds=1.1)
     job = await counting.until_final()
-    assert (job.state, job.started_at, job.partial) == ("missed", None, False)
+    assert (job.state, job.started_at, job.partial) == ("expired", None, False)
     assert job.error is not None
     assert job.error.code == "deadline_passed"
     assert f"{asked.start_by:%H:%M:%S}" in job.error.detail
     assert job.finished_at is not None
     assert job.finished_at >= asked.start_by
-    assert await counting.events() == ["queued", "missed"]
-    missed, counting.id = counting.id, running
+    assert await counting.events() == ["queued", "expired"]
+    expired, counting.id = counting.id, running
     await counting.stores.jobs.cancel(running)
     await counting.until_final()
     await counting.submit(3, 0.01)
     assert (await counting.until_final()).state == "succeeded", "the queue goes on without it"
-    assert (await counting.stores.jobs.get(missed)).state == "missed"
+    assert (await counting.stores.jobs.get(expired)).state == "expired"
     assert len(counting.starts()) == 2
 
 
@@ -95,7 +95,7 @@ async def test_a_running_job_ends_at_its_deadline_with_its_best_poses(
     assert events[-1].data | {"detail": ""} == {"code": "deadline_passed", "partial": True, "detail": ""}
 
 
-async def test_a_job_that_has_started_is_not_missed(counting: Counting, settings: Settings, slots: Slots):
+async def test_a_job_that_has_started_does_not_expire(counting: Counting, settings: Settings, slots: Slots):
     """Its time in the queue counts no more, even where it waits there again for a worker in the place of a lost one."""
     first = slots.start(settings, "a")
     await counting.submit(100, 0.05, details={"expires_in_queue_s": 3600})
@@ -163,7 +163,7 @@ async def test_whoever_sees_it_first_ends_an_overdue_job_once(
         release_worker(database, None, STALL_S),
     )
     job = await stores.jobs.get(job_id)
-    assert job.state == ("cancelled" if begun else "missed")
+    assert job.state == ("cancelled" if begun else "expired")
     assert job.error is not None
     assert job.error.code == "deadline_passed"
     ends = [event.type for event in await stores.jobs.events(job_id) if event.type == job.state]
@@ -185,7 +185,9 @@ async def test_a_claim_of_an_overdue_job_whose_row_still_says_running_ends_it(
     assert stopped_at_its_deadline(await stores.jobs.get(job.id))
 
 
-async def test_a_missed_job_is_told_counted_and_makes_room(stores: Stores, dataset_id: str):
+async def test_a_job_that_expired_in_the_queue_is_told_counted_and_makes_room(
+    stores: Stores, dataset_id: str
+):
     hook, _ = await stores.webhooks.create("local", "https://hooks.example.org/in", ALL_EVENTS)
     await stores.tenants.set("local", max_queued=1, max_running=1)
     job, _ = await stores.jobs.submit(dataset_id, FAST, expires_in_queue_s=3600)
@@ -197,15 +199,15 @@ async def test_a_missed_job_is_told_counted_and_makes_room(stores: Stores, datas
     assert (await stores.jobs.get(other.id)).queue_position == 1
     (held,) = await stores.jobs._database.fetch("SELECT held FROM jobs WHERE id = %s", other.id)
     assert not held["held"], "the limit of jobs at a time has room as well"
-    told = [item for item in (await stores.webhooks.deliveries(hook.id)).items if item.event == "job.missed"]
+    told = [item for item in (await stores.webhooks.deliveries(hook.id)).items if item.event == "job.expired"]
     assert len(told) == 1
     assert '"deadline_passed"' in told[0].body
-    assert [item.id for item in (await stores.jobs.list(state="missed")).items] == [job.id]
-    assert (await stores.jobs.counts())["missed"] == 1
+    assert [item.id for item in (await stores.jobs.list(state="expired")).items] == [job.id]
+    assert (await stores.jobs.counts())["expired"] == 1
     now = await stores.monitor.statistics()
-    assert now.jobs["missed"] == 1
+    assert now.jobs["expired"] == 1
     counted = {(tally.name, tally.label): tally.count for tally in now.tallies}
-    assert (counted["job_events", "missed"], counted["job_seconds", "missed"]) == (1, 1)
+    assert (counted["job_events", "expired"], counted["job_seconds", "expired"]) == (1, 1)
     await stores.jobs.delete(job.id)
 
 

@@ -14,7 +14,7 @@ Place = Literal["todo", "later", "doing", "over"]
 FENCED = "fenced"
 COUNTED = {"killed", "error"}
 MAX_CRASHES, MAX_LOSSES, MAX_ATTEMPTS = 3, 9, 30
-ENDS = {"succeeded", "failed", "cancelled", "missed"}
+ENDS = {"succeeded", "failed", "cancelled", "expired"}
 
 
 @dataclass(frozen=True)
@@ -109,11 +109,11 @@ def cancelled_by_client(name: str) -> Change:
 
 
 def _beyond_its_time(job: Job) -> Job:
-    """What never started is missed. What has ends at once where it waits, or else is asked to."""
+    """What never started expires. What has ends at once where it waits, or else is asked to."""
     place = "doing" if job.place == "doing" else "over"
     job = replace(job, place=place, abort=job.abort or place == "doing")
     if "started" not in job.events:
-        return job.with_event("missed", state="missed")
+        return job.with_event("expired", state="expired")
     job = replace(job, cancel_requested=True)
     return job.ended("cancelled") if job.state == "queued" else job.with_event("cancel_requested")
 

@@ -98,7 +98,7 @@ def broken_promises(
             or row["kept"] == [row["artifacts"][0]["key"].split("/")[3]],
             "counts more attempts than it started": row["attempt"] <= events.count("started"),
             "has lost the work of a stage, or keeps another's": not final
-            or row["state"] == "missed"  # without any
+            or row["state"] == "expired"  # without any
             or row["kept_work"] == [work and work.rpartition("/")[2]],
             "has a checkpoint that is to be deleted": final
             or row["checkpoint"] is None

@@ -172,7 +172,7 @@ CREATE INDEX batches_with_key ON batches (finished_at) WHERE idempotency_key IS 
 -- was joined stays when the other is deleted.) `share_round`: signed into links to its files; the next one ends them.
 -- `key_id`: the API key that submitted it. `attempt_…`: of the latest attempt, when it began, when it was last known to
 -- run, and its processor seconds until then; `processor_s`, `wall_s`, `gpu_s`: what all attempts that are over used.
--- `start_by`: a job that has not started by then ends as missed; never after `deadline_at`, at which all else of it ends.
+-- `start_by`: a job that has not started by then ends as expired; never after `deadline_at`, at which all else of it ends.
 -- fillfactor leaves space in each page, so that progress updates stay HOT (no index writes).
 CREATE TABLE jobs (
     id text PRIMARY KEY,
@@ -185,7 +185,7 @@ CREATE TABLE jobs (
     fixed_from text,
     batch_id text REFERENCES batches,
     state text NOT NULL DEFAULT 'queued'
-        CHECK (state IN ('queued', 'running', 'succeeded', 'failed', 'cancelled', 'missed', 'expired')),
+        CHECK (state IN ('queued', 'running', 'succeeded', 'failed', 'cancelled', 'expired')),
     options jsonb NOT NULL,
     planned_steps int,
     resolved_options jsonb,

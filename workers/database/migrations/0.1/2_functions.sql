@@ -220,7 +220,7 @@ BEGIN
 END;
 $$;
 CREATE TRIGGER tell_of_job AFTER INSERT ON job_events FOR EACH ROW
-    WHEN (NEW.type IN ('queued', 'started', 'succeeded', 'failed', 'cancelled', 'missed'))
+    WHEN (NEW.type IN ('queued', 'started', 'succeeded', 'failed', 'cancelled', 'expired'))
     EXECUTE FUNCTION tell_of_job();
 
 -- The end of a batch is written and told once, whichever of its jobs ends last and however: ends in a tenant's batches
@@ -283,7 +283,7 @@ $$;
 -- Only these end a stage: previews and checkpoints fall into the middle of one.
 CREATE FUNCTION tally_job_event() RETURNS trigger LANGUAGE plpgsql AS $$
 DECLARE
-    _marks text[] := '{started,stage,attempt_crashed,retried_smaller,requeued,succeeded,failed,cancelled,missed}';
+    _marks text[] := '{started,stage,attempt_crashed,retried_smaller,requeued,succeeded,failed,cancelled,expired}';
     _created timestamptz;
     _before record;
 BEGIN
@@ -301,7 +301,7 @@ BEGIN
     IF FOUND AND _before.type = 'stage' THEN
         PERFORM tally_seconds('stage_seconds', coalesce(_before.stage, ''), extract(epoch FROM NEW.at - _before.at));
     END IF;
-    IF NEW.type IN ('started', 'succeeded', 'failed', 'cancelled', 'missed') THEN
+    IF NEW.type IN ('started', 'succeeded', 'failed', 'cancelled', 'expired') THEN
         SELECT created_at INTO _created FROM jobs WHERE id = NEW.job_id;
         IF NEW.type <> 'started' THEN
             PERFORM tally_seconds('job_seconds', NEW.type, extract(epoch FROM NEW.at - _created));
