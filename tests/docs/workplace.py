@@ -128,6 +128,7 @@ class Workplace:
         return {
             r"\bJOB(?=/cancel)|(?<=cancel )JOB\b": self._new_job,
             r"\bJOB\b|\bjob_…": self.job,
+            r"\bBATCH\b": self._new_batch,
             r"\bDS\b": self._new_dataset,
             r"\bds_…": self._ready_dataset,
             r"\bUP\b": self._new_upload,
@@ -148,6 +149,11 @@ class Workplace:
         with self._http() as http:
             body = {"dataset_id": ready_dataset(http, self.folder / "photos")}
             return str(http.post("/v1/jobs", json=body).json()["id"])
+
+    def _new_batch(self) -> str:
+        with self._http() as http:
+            body = {"jobs": [{"dataset_id": ready_dataset(http, self.folder / "photos")}]}
+            return str(http.post("/v1/batches", json=body).json()["id"])
 
     def _new_dataset(self) -> str:
         with self._http() as http:
