@@ -180,8 +180,7 @@ class JobStore(OwnedStore):
             row = await self._required(connection, job_id)
             if row["kind"] != "refine":
                 raise Conflict("state_conflict", f"{job_id} is an export; its files are those of its parent.")
-            if row["state"] == "expired":
-                raise Expired(f"The files of job {job_id} were kept for their time and are gone.")
+            require_files(row)
             await add_deliveries(connection, self._settings, job_id, to)
             return job_from_row(await self._required(connection, job_id))
 
