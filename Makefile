@@ -31,10 +31,10 @@ web: setup  ## build the page and what report.html is made of, after a change of
 	$(BIN)/python hatch_build.py
 
 test: web  ## all tests but those of test-nightly; PYTEST="-k name" chooses
-	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --maxprocesses 4 --dist loadfile -m "not nightly" $(PYTEST)
+	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --maxprocesses 4 --dist loadfile --no-loadscope-reorder -m "not nightly" $(PYTEST)
 
 test-nightly: web  ## what takes long and seldom fails alone: deployment, pages' commands, notebooks, fuzz, storms, studies, benchmarks
-	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --maxprocesses 4 --dist loadfile -m nightly $(PYTEST)
+	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --maxprocesses 4 --dist loadfile --no-loadscope-reorder -m nightly $(PYTEST)
 
 test-fast: setup  ## within a minute: the tests that need no server and no browser and do not train
 	$(BIN)/python -m pytest -n logical --maxprocesses 4 --dist worksteal -m "not server and not browser and not slow and not nightly" $(PYTEST)
@@ -51,7 +51,7 @@ build/lowest.txt: pyproject.toml
 	  "==".join(re.match(r"([\w-]+)[^>]*>=([\d.]+)", r).groups()) for r in sum(p["optional-dependencies"].values(), p["dependencies"])}), sep="\n")' > $@
 
 coverage: web  ## all tests with branch coverage, printed by file; in build/coverage as HTML
-	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --maxprocesses 4 --dist loadfile --cov --cov-report=term \
+	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --maxprocesses 4 --dist loadfile --no-loadscope-reorder --cov --cov-report=term \
 	  --cov-report=html:build/coverage $(PYTEST)
 
 lint: setup  ## format, style, types, the direction of imports, and lengths of files and functions

@@ -77,10 +77,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 item.add_marker(marker)
         if item.nodeid.startswith(NIGHTLY) and not item.nodeid.endswith(FIRST_PAGES):
             item.add_marker("nightly")
+    # Files of long tests first, or one process is left with them while the others have nothing to do.
     long = {item.path for item in items if any(item.get_closest_marker(name) for name in ("browser", "slow"))}
-    items.sort(
-        key=lambda item: item.path not in long
-    )  # first, or one process ends with them while the others wait
+    items.sort(key=lambda item: item.path not in long)
 
 
 def _skips(config: pytest.Config) -> tuple[int, Counter[str]]:
