@@ -14,6 +14,7 @@ SHOWN = (
     "LICENSE",
     "docs/*.md",
     "docs/*.json",
+    "docs/*.txt",
     "docs/pictures/*",
     "docs/studies/*",
     "docs/site/*.css",
