@@ -11,7 +11,7 @@ from biresnerf.wire.jobs import JobKind
 from workers.database import job_queue
 from workers.database.database import Database
 from workers.jobs.deadlines import OVERDUE, end_overdue
-from workers.jobs.job_states import finish, finish_cancelled, start_attempt, trash_attempts
+from workers.jobs.job_states import drop_token, finish, finish_cancelled, start_attempt, trash_attempts
 from workers.jobs.setbacks import crashed_too_often, used_up
 from workers.process.waiting import retry_while_unavailable
 from workers.settings.errors import NotFound
@@ -77,7 +77,7 @@ async def _claim(
         if not await job_queue.lock_taken(connection, row["queue_id"], worker_id):
             return None
         if row["state"] == "running":  # the end of its last attempt was never written
-            await connection.execute("UPDATE jobs SET run_token = NULL WHERE id = %s", (job_id,))
+            await drop_token(connection, job_id)
         if row["overdue"] and not row["cancel_requested"]:
             await end_overdue(connection, row, stall_s)
         # Nobody runs it, though the row may say so.

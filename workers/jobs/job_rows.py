@@ -5,22 +5,15 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from datetime import UTC, datetime
 from typing import Any
 
 from psycopg.types.json import Jsonb
 
-from biresnerf.errors import InputError
 from biresnerf.options.refine_options import RefineOptions
-from biresnerf.wire.deliveries import DeliveredFile, DeliverTo
 from biresnerf.wire.jobs import JobEvent, JobProgress, JobTexts, JobUse, JobView
-from biresnerf.wire.problems import JobError
 from workers.database.database import Connection
-from workers.database.ids import new_id
 from workers.records import PREVIEW_FOLDER, THUMBNAIL_NAME, priority_name, record_from_row
 from workers.settings.errors import Conflict, Expired
-from workers.settings.settings import Settings
-from workers.webhooks.outbound import Policy, checked_url
 
 JOB = """
     SELECT jobs.*, CASE WHEN jobs.state = 'queued' THEN
@@ -119,44 +112,3 @@ async def events_of(connection: Connection, job_id: str, after: int, limit: int)
     select = "SELECT seq, at, attempt, type, data FROM job_events WHERE job_id = %s AND seq > %s"
     rows = await connection.rows(f"{select} ORDER BY seq LIMIT %s", job_id, after, limit)
     return tuple(map(JobEvent.model_validate, rows))
-
-
-async def add_deliveries(connection: Connection, settings: Settings, job_id: str, to: DeliverTo) -> None:
-    """Have files of a job, whose row is locked, sent once it is over; a new address replaces the one before.
-
-    Raises `InputError` (``address_refused``).
-    """
-    policy = Policy.of_files(settings)
-    for name, url in to.addresses:
-        try:
-            host = checked_url(url, policy).host
-        except InputError as error:
-            raise InputError.of(error.fault, where=name or "archive") from None
-        await connection.execute(
-            "DELETE FROM job_deliveries WHERE job_id = %s AND name IS NOT DISTINCT FROM %s", (job_id, name)
-        )
-        await connection.execute(
-            "INSERT INTO job_deliveries (id, job_id, name, url) VALUES (%s, %s, %s, %s)",
-            (new_id("dl"), job_id, name, url),
-        )
-        await _note(connection, job_id, DeliveredFile(name=name, host=host))
-    await connection.execute("SELECT pg_notify('biresnerf_webhooks', '')")
-
-
-async def note_delivery(
-    connection: Connection, job_id: str, name: str | None, host: str, error: JobError | None
-) -> None:
-    """Write down that a file was delivered, or why not; the job itself stays as it is."""
-    state = "delivered" if error is None else "failed"
-    note = DeliveredFile(name=name, host=host, state=state, at=datetime.now(UTC), error=error)
-    await _note(connection, job_id, note)
-
-
-async def _note(connection: Connection, job_id: str, note: DeliveredFile) -> None:
-    await connection.execute(
-        "UPDATE jobs SET revision = revision + 1, updated_at = clock_timestamp(), delivered = %s || ("
-        "SELECT coalesce(jsonb_agg(item), '[]') FROM jsonb_array_elements(delivered) AS item"
-        " WHERE item ->> 'name' IS DISTINCT FROM %s) WHERE id = %s",
-        (Jsonb([note.model_dump(mode="json")]), note.name, job_id),
-    )
-    await connection.execute("SELECT pg_notify('biresnerf_jobs', %s)", (job_id,))

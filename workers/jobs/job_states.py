@@ -74,6 +74,11 @@ async def start_attempt(connection: Connection, job_id: str, token: uuid.UUID) -
     return row
 
 
+async def drop_token(connection: Connection, job_id: str) -> None:
+    """Whoever ran the job can write no more, and its attempt counts until it was last seen."""
+    await connection.execute("UPDATE jobs SET run_token = NULL WHERE id = %s", (job_id,))
+
+
 @dataclass(frozen=True)
 class Requeue:
     """Why a job goes back to the queue, as an event, and with what changes.

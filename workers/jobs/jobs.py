@@ -17,11 +17,11 @@ from biresnerf.wire.jobs import JobDetails, JobEvent, JobState, JobTexts, JobVie
 from workers.database.database import Connection, Database, OwnedStore
 from workers.database.ids import new_id
 from workers.jobs.deadlines import limit_columns
+from workers.jobs.deliveries import add_deliveries
 from workers.jobs.job_rows import (
     JOB,
     MINE,
     PLACES,
-    add_deliveries,
     asked_columns,
     events_of,
     job_from_row,

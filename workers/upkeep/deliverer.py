@@ -16,7 +16,7 @@ from biresnerf.wire.problems import JobError
 from workers.database.claimed_work import LeasedWork
 from workers.database.database import Database
 from workers.database.notifications import Listener
-from workers.jobs.job_rows import note_delivery
+from workers.jobs.deliveries import DUE, lock_for_delivery, note_delivery
 from workers.jobs.jobs import JobStore
 from workers.records import Artifact
 from workers.settings.errors import Expired, NotFound, Unavailable
@@ -38,7 +38,7 @@ class Deliverer(LeasedWork):
 
     at_once, per_tenant = 8, 4
     table = "job_deliveries"
-    owners = "JOIN jobs ON jobs.id = work.job_id WHERE jobs.state NOT IN ('queued', 'running')"
+    owners = DUE
 
     def __init__(
         self,
@@ -106,8 +106,7 @@ class Deliverer(LeasedWork):
         if error is not None:
             log.info("a file of %s is not delivered: %s", row["job_id"], error)
         async with self._database.transaction() as connection:
-            # The job first, then its deliveries: who deletes it locks them in this order.
-            await connection.execute("SELECT 1 FROM jobs WHERE id = %s FOR NO KEY UPDATE", (row["job_id"],))
+            await lock_for_delivery(connection, row["job_id"])
             if await self._forget(connection, row["id"]):
                 await note_delivery(connection, row["job_id"], row["name"], host, error)
 

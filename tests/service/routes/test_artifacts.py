@@ -122,7 +122,7 @@ def test_a_result_whose_time_is_over_is_410_while_its_record_stays(
     assert http.head(here + "/artifacts/report.json").status_code == 410
     events = http.get(here + "/events").text
     assert "event: succeeded" in events
-    assert "event: expired" in events
+    assert "event: files_expired" in events
     folder = service.data_dir / "files" / "jobs" / job["id"]
     until(http, job["id"], lambda _: not folder.exists())
     until(http, job["id"], lambda _: f"deleted jobs/{job['id']}: " in service.log.read_text())

@@ -13,8 +13,7 @@ from biresnerf.options.refine_options import RefineOptions
 from biresnerf.wire.jobs import JobView
 from tests.workers.conftest import Counting, Slots, quick_settings, ready_dataset
 from workers.engine import Stores, open_stores
-from workers.jobs.derived_jobs import DerivedJobs
-from workers.jobs.forks import plan_fork
+from workers.jobs.derived_jobs import DerivedJobs, plan_fork
 from workers.settings.errors import Conflict, LimitReached, NotFound
 
 SMALL = RefineOptions(

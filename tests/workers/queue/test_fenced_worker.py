@@ -217,18 +217,18 @@ async def test_a_result_that_was_stored_in_vain_is_taken_away_again(
     attempt = Attempt(database, files, settings, claim, folder, {})
     stored: list[str] = []
 
-    async def another_worker_takes_the_job(_: Attempt) -> int:
+    async def finishes(_: Attempt) -> int:
         (folder / "output").mkdir(parents=True)
         (folder / "output" / "report.json").write_text("{}")
-        assert await claimed(database, claim.job_id) is not None
         return 0
 
     async def published(ledger: Ledger, artifacts, *rest) -> bool:
         stored.extend(artifact.key for artifact in artifacts)
+        assert await claimed(database, claim.job_id) is not None  # another worker takes the job
         return await publish(ledger, artifacts, *rest)
 
     publish = Ledger.publish
-    monkeypatch.setattr(Attempt, "_run_process", another_worker_takes_the_job)
+    monkeypatch.setattr(Attempt, "_run_process", finishes)
     monkeypatch.setattr(Ledger, "publish", published)
     with pytest.raises(Fenced):
         await attempt.run()
