@@ -17,7 +17,7 @@ from biresnerf.wire.jobs import JobDetails, JobEvent, JobState, JobTexts, JobVie
 from workers.database.database import Connection, Database, OwnedStore
 from workers.database.ids import new_id
 from workers.jobs.deadlines import limit_columns
-from workers.jobs.deliveries import add_deliveries
+from workers.jobs.deliveries import add_deliveries, lock_for_delivery
 from workers.jobs.job_rows import (
     JOB,
     MINE,
@@ -176,7 +176,7 @@ class JobStore(OwnedStore):
         Raises `NotFound`, `Expired`, `Conflict` (``state_conflict``: an export), `InputError` (``address_refused``).
         """
         async with self._database.transaction() as connection:
-            await connection.execute("SELECT 1 FROM jobs WHERE id = %s FOR NO KEY UPDATE", (job_id,))
+            await lock_for_delivery(connection, job_id)
             row = await self._required(connection, job_id)
             if row["kind"] != "refine":
                 raise Conflict("state_conflict", f"{job_id} is an export; its files are those of its parent.")
