@@ -89,6 +89,6 @@ def _told(address: str) -> Iterator[None]:
     try:
         yield
     except (BotoCoreError, ClientError) as error:
-        raise InputError(
-            "bucket_unreadable", f"{error}", where=address, hint="Check credentials, region and endpoint."
-        ) from None
+        detail = f"{str(error).rstrip('.')}."
+        hint = "Check credentials, region and endpoint."
+        raise InputError("bucket_unreadable", detail, where=address, hint=hint) from None
