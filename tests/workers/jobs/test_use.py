@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import sys
 from collections.abc import Awaitable, Callable
-from datetime import UTC, datetime
+from datetime import UTC, date, datetime, timedelta
 from typing import Any
 
 import pytest
@@ -33,7 +33,6 @@ from workers.settings.errors import LimitReached
 from workers.settings.settings import Settings
 
 pytestmark = pytest.mark.anyio
-TODAY = datetime.now(UTC).date()
 # Says in its result what it used by its own account, with a child that it waited for; then ends as the plan says.
 BURNING = """
 import json, os, pathlib, resource, signal, subprocess, sys, time
@@ -54,6 +53,11 @@ report = {"steps": 0, "used": sum(part.ru_utime + part.ru_stime for part in used
 pathlib.Path("output/report.json").write_text(json.dumps(report))
 """
 BURNT_S = 0.95  # the kernel counts ticks of a hundredth
+
+
+def today() -> date:
+    """Asked each time: midnight may pass while the tests run."""
+    return datetime.now(UTC).date()
 
 
 @pytest.fixture
@@ -103,7 +107,7 @@ async def _until_burnt(counting: Counting) -> None:
 async def test_each_attempt_counts_once_however_it_ends(
     counting: Counting, burning: Settings, slots: Slots, end: str, state: str
 ):
-    database = counting.stores.jobs._database
+    database, began_on = counting.stores.jobs._database, today()
     slots.start(burning, "a")
     await counting.submit(0, 0.0, end=end)
     if end == "wait":
@@ -118,7 +122,7 @@ async def test_each_attempt_counts_once_however_it_ends(
     assert all(BURNT_S <= record["processor_s"] < 3 * BURNT_S for record in counted), "killed ones as well"
     assert job.use.processor_s == pytest.approx(sum(record["processor_s"] for record in counted))
     assert job.use.wall_s == pytest.approx(sum(record["wall_s"] for record in counted))
-    assert {record["day"] for record in counted} <= {TODAY, datetime.now(UTC).date()}
+    assert {record["day"] for record in counted} <= {began_on, today()}
 
 
 async def test_an_attempt_that_is_stopped_counts_and_so_does_the_next(
@@ -269,12 +273,12 @@ async def test_use_outlives_its_job_and_is_the_same_once_it_is_added_up(stores: 
     await _used(database, "anna", "key_1", "2026-02-01", 8.0, "gpu")
     await _used(database, "anna", "key_2", "2026-02-01", 16.0)
     keys = ("day", "tenant", "key")
-    first = datetime(2026, 1, 31).date()
-    before = await stores.tenants.usage(first, TODAY, keys, None, 9)
+    first, last = datetime(2026, 1, 31).date(), today() + timedelta(1)
+    before = await stores.tenants.usage(first, last, keys, None, 9)
     await stores.jobs.delete(claim.job_id)
     for _ in range(2):
         await database.run(fold_use)
-        assert await stores.tenants.usage(first, TODAY, keys, None, 9) == before
+        assert await stores.tenants.usage(first, last, keys, None, 9) == before
     assert len(await records(database)) == len(before) == 4
     assert [
         (row.tenant, row.key_id, row.attempts, row.wall_s, row.processor_s, row.gpu_s) for row in before[:3]
@@ -285,7 +289,7 @@ async def test_use_outlives_its_job_and_is_the_same_once_it_is_added_up(stores: 
     ]
     (anna,) = await stores.tenants.usage(first, first, ["tenant"], "anna", 9)
     assert (anna.day, anna.tenant, anna.key_id, anna.wall_s) == (None, "anna", None, 7.0)
-    assert [row.wall_s for row in await stores.tenants.usage(first, TODAY, ["device"], "anna", 9)] == [
+    assert [row.wall_s for row in await stores.tenants.usage(first, last, ["device"], "anna", 9)] == [
         23.0,
         8.0,
     ]
@@ -298,12 +302,12 @@ async def test_a_tenant_at_its_seconds_of_the_day_submits_no_more_until_midnight
     await stores.tenants.set("local", max_daily_seconds=150)
     yesterday = "(clock_timestamp() AT TIME ZONE 'UTC')::date - 1"
     await _used(database, "local", "", "2026-01-31", 500.0)
-    await _used(database, "anna", "", str(TODAY), 500.0)
+    await _used(database, "anna", "", str(today()), 500.0)
     await database.fetch(f"UPDATE use_records SET day = {yesterday} WHERE tenant = 'local' RETURNING day")
     claim = await _begun(stores)
     assert (await stores.tenants.share("local")).seconds_today == pytest.approx(100, abs=5), "it still runs"
     await stores.jobs.submit(dataset, RefineOptions(preset="fast"))
-    await _used(database, "local", "", str(datetime.now(UTC).date()), 51.0)
+    await _used(database, "local", "", str(today()), 51.0)
     with pytest.raises(LimitReached) as refused:
         await stores.jobs.submit(dataset, RefineOptions(preset="fast"))
     assert refused.value.code == "daily_limit_reached"
