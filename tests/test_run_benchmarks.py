@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from benchmarks.runs import anytime, shares, time_left
+from benchmarks.runs import shares, time_left
 from biresnerf.data.synthetic.scene import write_synthetic_scene
 
 pytestmark = pytest.mark.slow
@@ -81,16 +81,3 @@ def test_the_processors_clock_counts_children_that_run_and_those_that_ended():
     child.communicate(b"\n")
     assert 0.45 < running < 1.5
     assert running - 0.05 < time_left.processor_s() - began < 1.5
-
-
-def test_a_run_killed_at_once_leaves_nothing_and_a_stopped_one_its_poses(scene, tmp_path):
-    run = anytime.Run(scene, "fast", 0.05, 1, tuple(f"{key}={value}" for key, value in SMALL.items()))
-    truth = run.truth()
-    run.killed_after(0.2, tmp_path / "killed")
-    assert anytime.left_behind(tmp_path / "killed", truth).startswith(" no poses yet |")
-    run.refine(tmp_path / "whole")
-    rotation, centres, verdict, how_far = anytime.left_behind(tmp_path / "whole", truth).split("|")[:4]
-    assert 0 <= float(rotation.rstrip("° ")) < 10
-    assert centres.endswith("% ")
-    assert how_far == " complete "
-    assert verdict.strip()

@@ -6,9 +6,9 @@ shared memory, registers of a thread and what of them is spilt to the stack (byt
 
 from __future__ import annotations
 
+import argparse
 import re
 import subprocess
-import sys
 import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -136,7 +136,9 @@ def compiled(launch: Launch, capability: int) -> Usage:
 
 def main() -> None:
     """Print the table."""
-    for capability in [int(argument) for argument in sys.argv[1:]] or [80, 90]:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("capabilities", type=int, nargs="*", default=[80, 90])
+    for capability in parser.parse_args().capabilities:
         print(f"{f'capability {capability}':60}{'shared':>8}{'registers':>11}{'stack':>8}")
         for told, launch in kernels().items():
             usage = compiled(launch, capability)

@@ -26,7 +26,7 @@ def commands(work: Path) -> list[tuple[str, ...]]:
         (*biresnerf, "doctor"),
         (*PYTHON, "biresnerf.field.cuda.device_check"),
         (*PYTHON, "pytest", "-q", "-n", "0", *gpu_tests),
-        (*PYTHON, "benchmarks", "cuda"),
+        (*PYTHON, "benchmarks"),
         (*biresnerf, "make-scene", str(scene), "--views", "60", "--size", "400", "--seed", "1"),
         (*biresnerf, "refine", str(scene), "-o", str(work / "out"), "--preset", "fast", "--device", "cuda"),
         (*biresnerf, "evaluate", str(work / "out"), f"{scene}.truth.json"),

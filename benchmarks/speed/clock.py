@@ -44,25 +44,17 @@ def ratio(slow: list[float], fast: list[float]) -> float:
 
 
 @contextmanager
-def timed(
-    functions: list[tuple[Any, str, str]], clock: Clock, *, outermost: bool = False
-) -> Iterator[dict[str, float]]:
-    """Within this context, seconds spent in (owner, attribute, label) add up under their labels.
-
-    With `outermost` what one of them calls counts as its own alone.
-    """
-    spent, running = {label: 0.0 for _, _, label in functions}, [False]
+def timed(functions: list[tuple[Any, str, str]], clock: Clock) -> Iterator[dict[str, float]]:
+    """Within this context, seconds spent in (owner, attribute, label) add up under their labels."""
+    spent = {label: 0.0 for _, _, label in functions}
     kept = [(owner, name, getattr(owner, name)) for owner, name, _ in functions]
 
     def wrapped(function: Callable[..., Any], label: str) -> Callable[..., Any]:
         def measured(*arguments: Any, **named: Any) -> Any:
-            if running[0]:
-                return function(*arguments, **named)
-            started, running[0] = clock(), outermost
+            started = clock()
             try:
                 return function(*arguments, **named)
             finally:
-                running[0] = False
                 spent[label] += clock() - started
 
         return measured

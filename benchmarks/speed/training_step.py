@@ -1,4 +1,4 @@
-"""A whole training step: ours against plain torch, and what its parts take."""
+"""A whole training step and what its parts take: `make bench`. The definition in plain torch may compete."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import torch
 
 from benchmarks.speed import scene
 from benchmarks.speed.clock import Clock, interleave, peak_memory, ratio, summary, timed
-from benchmarks.speed.torch_forms import UnrolledField, VectorisedField
 from biresnerf.field.cpu import field as cpu_field
 from biresnerf.field.reference.field import ReferenceField
 from biresnerf.refinement.optimise import joint_step
@@ -20,7 +19,6 @@ from biresnerf.refinement.optimise.joint_optimiser import OCCUPANCY_PERIOD, Join
 from biresnerf.refinement.optimise.photo_sampler import PhotoSampler
 from biresnerf.refinement.parameters.pose_parameters import PoseParameters
 
-FORWARD, BACKWARD = "networks forward, composite", "composite and networks back, position gradient"
 OPERATIONS = [
     (PhotoSampler, "draw", "draw pixels"),
     (PoseParameters, "matrices", "pose matrices"),
@@ -32,22 +30,14 @@ OPERATIONS = [
     (cpu_field.CpuField, "_density", "estimate of densities"),
     (cpu_field, "merge", "merge intervals"),
     (cpu_field.CpuField, "_encode", "encode"),
-    (cpu_field, "render_segments", FORWARD),
-    (cpu_field, "render_segments_backward", BACKWARD),
+    (cpu_field, "render_segments", "networks forward, composite"),
+    (cpu_field, "render_segments_backward", "composite and networks back, position gradient"),
     (cpu_field, "ray_gradients", "sum into rays"),
     (cpu_field.encoding, "update_table", "table gradient and Adam"),
     (PoseParameters, "step", "Adam on poses"),
 ]
-BETWEEN_KERNELS = {"draw pixels", "pose matrices", "cast rays", "Adam on poses"}  # outside the field
 BEFORE = "every interval"  # the form without merging; counted with cells looked at by density
-FORWARD_MACS = 64 * 16 + 32 * 64 + 64 * 64 + 64 * 4  # of both networks but for the first layer
-
-
-def _flops(width: int) -> float:
-    """Of both networks per sample: forward once, again but for two products on the way back, twice for gradients."""
-    forward = FORWARD_MACS + 64 * width
-    again = forward - 64 * 16 - 64 * 4
-    return 2.0 * (forward + again + 2 * forward)
+DEFINITION = "plain torch"
 
 
 def _every_interval(ours: JointOptimiser) -> JointOptimiser:
@@ -74,18 +64,12 @@ def _cells_s(ours: JointOptimiser, rounds: int, clock: Clock) -> dict[str, float
     return {name: float(np.median(each)) / OCCUPANCY_PERIOD for name, each in seconds.items()}
 
 
-def _alternatives(ours: JointOptimiser, definition: bool) -> dict[str, JointOptimiser]:
-    """The same on other fields, which are trained as far."""
-    kinds: dict[str, Any] = {"unrolled": UnrolledField, "vectorised": VectorisedField}
-    if definition:
-        kinds["definition"] = ReferenceField
-    made = {}
-    for name, kind in kinds.items():
-        rival, field = _every_interval(ours), kind(ours.field.shape, 0, scene.CPU)
-        field.load_state(ours.field.state())
-        rival.field = field
-        made[name] = rival
-    return made
+def _definition(ours: JointOptimiser) -> JointOptimiser:
+    """The same on the field that defines what the kernels compute, which is trained as far."""
+    rival, field = _every_interval(ours), ReferenceField(ours.field.shape, 0, scene.CPU)
+    field.load_state(ours.field.state())
+    rival.field = field
+    return rival
 
 
 def _parts_ms(joint: JointOptimiser, rays: int, steps: int, clock: Clock) -> dict[str, float]:
@@ -99,9 +83,7 @@ def _parts_ms(joint: JointOptimiser, rays: int, steps: int, clock: Clock) -> dic
     return {label: 1e3 * float(np.median(values)) for label, values in parts.items()}
 
 
-def run(
-    rays: int, rounds: int, threads: int, clock: Clock, limit: dict[str, float], definition: bool
-) -> list[dict]:
+def run(rays: int, rounds: int, threads: int, clock: Clock, definition: bool) -> list[dict[str, Any]]:
     """One row per stage, at the paper's encodings."""
     rows: list[dict[str, Any]] = []
     for stage in ("coarse", "fine"):
@@ -113,16 +95,15 @@ def run(
             scene.step(rival, rays)
             torch.set_num_threads(1)
 
-        rivals, unmerged = _alternatives(ours, definition), _every_interval(ours)
+        unmerged = _every_interval(ours)
         competitors = {"kernels": lambda ours=ours: scene.step(ours, rays)}
         competitors[BEFORE] = lambda rival=unmerged: scene.step(rival, rays)
-        competitors |= {name: lambda r=rival: torch_step(r) for name, rival in rivals.items()}
+        if definition:
+            plain = _definition(ours)
+            competitors[DEFINITION] = lambda rival=plain: torch_step(rival)
         seconds = interleave(competitors, rounds, clock)
-        with peak_memory() as slow_memory:
-            torch_step(rivals["unrolled"])
         with peak_memory() as memory:
             medians = _parts_ms(ours, rays, 3 * rounds, clock)
-        networks = _parts_ms(unmerged, rays, rounds, clock)
         cells = _cells_s(ours, rounds, clock)
         medians |= {f"occupancy, per step, by {name}": 1e3 * value for name, value in cells.items()}
         fast = float(np.median(seconds["kernels"])) + cells["estimate"]
@@ -131,17 +112,10 @@ def run(
             [s + cells["density"] for s in seconds[BEFORE]],
             [s + cells["estimate"] for s in seconds["kernels"]],
         )
-        width = ours.field.shape.pose_grid.width + (
-            ours.field.shape.reconstruction_grid.width if stage == "fine" else 0
-        )
-        network_s = 1e-3 * (networks[FORWARD] + networks[BACKWARD])
         rows.append({
             "stage": stage, "rays": rays, "samples": samples, "kernels": summary(seconds["kernels"]),
             "ns_per_sample": 1e9 * fast / samples, "samples_per_s": samples / fast, "rays_per_s": rays / fast,
             "rivals": {name: summary(v) for name, v in seconds.items() if name != "kernels"},
-            "times_faster": times_faster,
-            "parts_ms": medians, "share_of_gflops": _flops(width) * samples / network_s / 1e9 / limit["gflops"],
-            "peak_added_mib": memory["added_mib"], "peak_added_mib_unrolled": slow_memory["added_mib"],
+            "times_faster": times_faster, "parts_ms": medians, "peak_added_mib": memory["added_mib"],
         })  # fmt: skip
-        del rivals, competitors
     return rows

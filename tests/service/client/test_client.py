@@ -15,10 +15,10 @@ import anyio.from_thread
 import httpx
 import pytest
 
-from benchmarks.service.upload import Relay
 from biresnerf.client import AsyncClient, Client, JobNotOver, Sending, ServiceError, StreamEvent
 from biresnerf.errors import InputError
 from biresnerf.wire.jobs import JobView
+from tests.service.client.relay import Relay
 from tests.service.conftest import Running, finished, scene_files, submit
 
 QUICK = {"preset": "fast", "steps": 20, "seed": 5}

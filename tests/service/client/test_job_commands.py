@@ -20,7 +20,6 @@ import httpx
 import pytest
 from click.testing import CliRunner, Result
 
-from benchmarks.service.upload import Relay
 from biresnerf.client import Client, ServiceError
 from biresnerf.commands import exit_codes
 from biresnerf.commands.jobs.download import download_command
@@ -36,6 +35,7 @@ from biresnerf.commands.jobs.jobs import (
 )
 from biresnerf.commands.jobs.service_options import exit_code_of
 from biresnerf.commands.jobs.submit import submit_command
+from tests.service.client.relay import Relay
 from tests.service.conftest import Running, Tenant, finished, submit, until
 from tests.service.free_port import free_port
 

@@ -12,8 +12,8 @@ from urllib.parse import urlsplit
 import httpx
 import pytest
 
-from benchmarks.service.upload import Relay
 from biresnerf.client import Client, LocalFile, ServiceError
+from tests.service.client.relay import Relay
 from tests.service.conftest import MIB, Running
 
 

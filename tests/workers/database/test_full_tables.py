@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from benchmarks.load.parts import fill
-from benchmarks.service.full_tables import Copies, Operations, timed, vacuum
 from biresnerf.options.refine_options import RefineOptions
+from tests.workers.database.full_tables import Copies, Operations, rows_scanned
 from workers.database.database import open_database
 from workers.engine import Stores
 from workers.settings.settings import Settings
@@ -26,9 +26,8 @@ async def test_no_operation_scans_the_jobs(stores: Stores, settings: Settings, d
         await Copies(database, job.id).make(OVER)
         await operations.all()["expiry's round"]()  # gives them their dates
         await fill(database, dataset_id, WAITING)
-        await vacuum(database)
         scans = {}
         for name, operation in operations.all().items():
-            figures = await timed(database, operation, 3)
-            scans[name] = {table: rows for table, rows in figures["scanned"].items() if table in LARGE}
+            read = await rows_scanned(database, operation, 3)
+            scans[name] = {table: rows for table, rows in read.items() if table in LARGE}
     assert {name: tables for name, tables in scans.items() if tables} == {}
