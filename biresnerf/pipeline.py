@@ -27,7 +27,9 @@ from biresnerf.data.points.tracks import Tracks
 from biresnerf.data.seeding.seed_poses import seed_poses
 from biresnerf.errors import Interrupted
 from biresnerf.field.backends import resolve_here, use_threads
-from biresnerf.forecast import TELLING_S, Forecast, remember_rates, remembered_rates
+from biresnerf.forecast.processor_share import ProcessorShare
+from biresnerf.forecast.rates import machine_rates, remember_rates
+from biresnerf.forecast.run_forecast import TELLING_S, Forecast
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.progress import Monitor, OnProgress, Progress, told_before_the_run
 from biresnerf.refinement.finish.rounds import run_stage_2
@@ -86,11 +88,17 @@ def refine_poses(
         Interrupted: stopped by `should_stop`; the checkpoint and a partial result are in `output`, or nothing
             yet where initial poses were still being looked for.
     """
-    started = time.monotonic()
-    setup = _set_up(
-        Path(output), options, on_progress, should_stop, keep_reusable=keep_reusable, overwrite=overwrite
-    )
+    started, share = time.monotonic(), ProcessorShare()
+    with share.watching():
+        setup = _set_up(
+            *(Path(output), options, on_progress, should_stop, share),
+            keep_reusable=keep_reusable,
+            overwrite=overwrite,
+        )
+        return _refine(input, setup, observer, started)
 
+
+def _refine(input: str | Path | Dataset, setup: _Setup, observer: Observer | None, started: float) -> Report:
     dataset = input if isinstance(input, Dataset) else _read(Path(input), setup)
     dataset = without_copies(without_photos(dataset, setup.options.leave_out), setup.options.fixed)
     dataset = with_shared_predictions(dataset)
@@ -147,6 +155,7 @@ def _set_up(
     asked: RefineOptions,
     on_progress: OnProgress | None,
     should_stop: Callable[[], bool] | None,
+    share: ProcessorShare,
     *,
     keep_reusable: bool,
     overwrite: bool,
@@ -159,7 +168,7 @@ def _set_up(
     earlier = earlier_work(folder.path)
     options, device = resolve_here(asked)
     threads = use_threads(options.threads)
-    forecast = Forecast(remembered_rates(device.type, threads))
+    forecast = Forecast(machine_rates(device.type, threads).seconds, share.between)
     monitor = Monitor(on_progress or (lambda _progress: None), should_stop or (lambda: False), forecast)
     message = "loading kernels (the first run compiles them)"
     monitor.report(Progress(stage="preparing", message=message, options=options))

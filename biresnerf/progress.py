@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pydantic import Field
 
 from biresnerf.errors import Interrupted
-from biresnerf.forecast import Forecast
+from biresnerf.forecast.run_forecast import Forecast
 from biresnerf.frozen_model import FrozenModel
 from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.stages import ReusableStage, Stage
@@ -22,7 +22,10 @@ class Progress(FrozenModel):
     steps_total: int = Field(0, ge=0)
     fraction: float = Field(0.0, ge=0.0, le=1.0)
     eta_s: float | None = Field(None, ge=0.0, description="Estimated seconds to the end of the run.")
-    metrics: dict[str, float] = Field(default_factory=dict)
+    metrics: dict[str, float] = Field(
+        default_factory=dict,
+        description="With ``machine_busy``: 1 while other programs take much of the processor, otherwise 0.",
+    )
     message: str = ""
     options: ResolvedOptions | None = Field(
         None,
@@ -80,7 +83,10 @@ class Monitor:
     def report(self, progress: Progress) -> None:
         """Tell what is done, with the fraction and the time left as they are now."""
         fraction, eta_s = self.forecast.now()
-        self.on_progress(progress.model_copy(update={"fraction": fraction, "eta_s": eta_s}))
+        metrics = {**progress.metrics, "machine_busy": float(self.forecast.machine_is_busy())}
+        self.on_progress(
+            progress.model_copy(update={"fraction": fraction, "eta_s": eta_s, "metrics": metrics})
+        )
 
     def report_end(self, steps: int) -> None:
         """The run is complete, after so many steps."""

@@ -23,7 +23,7 @@ from unittest import mock
 from biresnerf import pipeline
 from biresnerf.commands.settings_option import parse_settings
 from biresnerf.compile_kernels import compile_kernels
-from biresnerf.forecast import RATES, UNITS, Forecast, Phase, Unit
+from biresnerf.forecast.run_forecast import RATES, UNITS, Forecast, Phase, Unit
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.options.refine_options import parse_options
 from biresnerf.progress import Progress
@@ -58,8 +58,8 @@ CLOCKS: dict[str, Callable[[], float]] = {"wall": time.monotonic, "cpu": process
 class Watched(Forecast):
     """A forecast that keeps what it said of each phase at each report, and what the phase had taken by then."""
 
-    def __init__(self, rates: Mapping[Unit, float]) -> None:
-        super().__init__(rates)
+    def __init__(self, rates: Mapping[Unit, float], share: Callable[[float, float], float]) -> None:
+        super().__init__(rates, share)
         self.said: list[tuple[float, dict[Phase, float], dict[Phase, float]]] = []
         self.taken: dict[Phase, float] = {}
         self.worked: dict[Phase, float] = {}
@@ -116,8 +116,8 @@ def told_and_taken(
     def listen(progress: Progress) -> None:
         told.append((time.monotonic(), progress.eta_s))
 
-    def forecast(rates: Mapping[Unit, float]) -> Watched:
-        made.append(Watched(rates))
+    def forecast(rates: Mapping[Unit, float], share: Callable[[float, float], float]) -> Watched:
+        made.append(Watched(rates, share))
         return made[-1]
 
     if clock == "cpu":
@@ -126,8 +126,8 @@ def told_and_taken(
         tempfile.TemporaryDirectory() as folder,
         mock.patch.object(time, "monotonic", CLOCKS[clock]),
         mock.patch.object(pipeline, "Forecast", forecast),
-        mock.patch.object(pipeline, "remembered_rates", general_rates),
-        mock.patch.object(pipeline, "remember_rates"),
+        tempfile.TemporaryDirectory() as memory,
+        mock.patch.dict(os.environ, {"XDG_CACHE_HOME": memory}),
     ):
         began = time.monotonic()
         pipeline.refine_poses(given, Path(folder), parse_options({"preset": preset, **settings}), listen)
@@ -145,11 +145,6 @@ def told_and_taken(
 def at_general_rates(amounts: Mapping[Phase, float]) -> float:
     """Seconds of one core that these amounts of work take."""
     return sum(amount * RATES[UNITS[phase]] for phase, amount in amounts.items())
-
-
-def general_rates(_device: str, threads: int) -> dict[Unit, float]:
-    """Of a machine where nothing was measured yet."""
-    return {unit: rate / threads for unit, rate in RATES.items()}
 
 
 def main() -> None:

@@ -18,7 +18,7 @@ from biresnerf.data.seeding.map_images import (
     thoroughness,
 )
 from biresnerf.data.seeding.match_poses import can_match
-from biresnerf.forecast import UNITS, Phase, Unit
+from biresnerf.forecast.run_forecast import Phase
 from biresnerf.options.refine_options import ResolvedOptions, SeedingEffort
 
 # Shares of all steps: where cameras are adjusted first, and how long the field then learns at their poses. The first is
@@ -71,10 +71,6 @@ class Workload:
     amounts: Mapping[Phase, float]
     step_weights: Mapping[Phase, float]
     share: float
-
-    def seconds(self, rates: Mapping[Unit, float]) -> float:
-        """How long it takes where a unit of work takes so long."""
-        return sum(amount * rates[UNITS[phase]] for phase, amount in self.amounts.items())
 
 
 def workload(dataset: Dataset, options: ResolvedOptions, *, unbounded: bool, adjusts: bool) -> Workload:

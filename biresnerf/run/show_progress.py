@@ -60,7 +60,8 @@ def in_words(progress: Progress) -> str:
         parts.append(f"train PSNR {progress.metrics['psnr']:.1f} dB")
     if progress.eta_s is not None and progress.eta_s > 0:
         minutes, seconds = divmod(round(progress.eta_s), 60)
-        parts.append(f"{minutes}:{seconds:02d} left")
+        busy = " (the machine is busy now)" if progress.metrics.get("machine_busy") else ""
+        parts.append(f"{minutes}:{seconds:02d} left{busy}")
     if progress.message:
         parts.append(progress.message)
     return "  ".join(parts)

@@ -49,11 +49,11 @@ class CheckReport(Record):
         examples=[None],
         description="Whether the given poses are meant in another way; null: it seems not.",
     )
-    expected_s: dict[PresetName, float] = Field(
+    expected_s: dict[PresetName, tuple[float, float]] = Field(
         {},
-        examples=[{"fast": 95.0, "balanced": 340.0}],
-        description="Seconds that a job with each preset would take, by what the latest jobs there "
-        "measured, or general figures before there was one; on the machine that checked it.",
+        examples=[{"fast": (95.0, 95.0), "balanced": (230.0, 690.0)}],
+        description="The least and the most seconds that a job with each preset is expected to take on the idle "
+        "machine that checked it: the same number twice where earlier jobs there measured all of it.",
     )
 
 

@@ -16,7 +16,7 @@ from biresnerf.data.show.renders import picture_stems
 from biresnerf.data.show.view_file import PREVIEW, THUMBNAIL
 from biresnerf.data.show.view_pictures import write_thumbnail
 from biresnerf.data.workload import matching_work
-from biresnerf.forecast import Phase
+from biresnerf.forecast.run_forecast import Phase
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.progress import Monitor, Progress
 from biresnerf.refinement.stages.two_stages import TwoStages

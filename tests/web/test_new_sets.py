@@ -44,7 +44,7 @@ def test_a_sample_set_is_one_click_away(page: Page, service: Running) -> None:
     expect(check_row(page, "Images")).to_contain_text("24 images")
     times = page.locator(".preset-time")
     expect(times).to_have_count(4)
-    expect(times.first).to_have_text(re.compile(r"about \d+(\.\d)? (s|min|h) here"))
+    expect(times.first).to_have_text(re.compile(r"about \d+( s)?( to \d+)? (s|min|h) here"))
     expect(page.get_by_role("button", name="Refine the poses")).to_be_visible()
     # It waits in the list, with its first photo, until its job is started.
     page.goto(service.url)

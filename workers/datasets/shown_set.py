@@ -16,7 +16,7 @@ from biresnerf.data.photos.masks import mask_place
 from biresnerf.data.photos.panoramas.cut_panoramas import as_views
 from biresnerf.data.show.view_pictures import CELL_PX, THUMBNAIL_PX, write_contact_sheet, write_thumbnail
 from biresnerf.data.workload import can_be_adjusted, workload
-from biresnerf.forecast import latest_machine, remembered_rates
+from biresnerf.forecast.rates import latest_machine, machine_rates
 from biresnerf.options.given_poses import PoseReading
 from biresnerf.options.presets import PRESETS, ComputeDevice, PresetName
 from biresnerf.options.refine_options import RefineOptions
@@ -86,14 +86,14 @@ def _inside(path: Path, folder: Path) -> str:
     return Path(os.path.relpath(path, folder)).as_posix()
 
 
-def expected_seconds(dataset: Dataset, *, unbounded: bool) -> dict[PresetName, float]:
-    """Seconds that a job with each preset would take, on a machine as that of the latest job here."""
-    kind, threads = latest_machine() or ("cpu", usable_cores())
+def expected_seconds(dataset: Dataset, *, unbounded: bool) -> dict[PresetName, tuple[float, float]]:
+    """Least and most seconds that a job with each preset would take, on a machine as that of the latest job here."""
+    kind, threads = latest_machine(usable_cores())
     device: ComputeDevice = "cuda" if kind == "cuda" else "cpu"
-    rates, adjusts = remembered_rates(device, threads), can_be_adjusted(len(as_views(dataset)))
-    return {
-        preset: workload(
-            dataset, RefineOptions(preset=preset).resolved(device), unbounded=unbounded, adjusts=adjusts
-        ).seconds(rates)
-        for preset in PRESETS
-    }
+    rates, adjusts = machine_rates(device, threads), can_be_adjusted(len(as_views(dataset)))
+    found: dict[PresetName, tuple[float, float]] = {}
+    for preset in PRESETS:
+        options = RefineOptions(preset=preset).resolved(device)
+        work = workload(dataset, options, unbounded=unbounded, adjusts=adjusts)
+        found[preset] = rates.between(work.amounts)
+    return found

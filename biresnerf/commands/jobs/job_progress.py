@@ -166,4 +166,6 @@ def left_of(job: JobView) -> str:
     if left is None:
         return "?"
     minutes, seconds = divmod(round(left), 60)
-    return f"{minutes}:{seconds:02d}"
+    return f"{minutes}:{seconds:02d}" + (
+        " (its machine is busy now)" if job.metrics.get("machine_busy") else ""
+    )

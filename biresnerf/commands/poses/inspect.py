@@ -122,25 +122,26 @@ def plan(dataset: Dataset, options: ResolvedOptions) -> dict[str, Any]:
     }
 
 
-def expected_seconds(dataset: Dataset, asked: RefineOptions) -> dict[PresetName, float]:
-    """Seconds that a run with each preset would take on this machine, by what earlier runs measured.
+def expected_seconds(dataset: Dataset, asked: RefineOptions) -> dict[PresetName, tuple[float, float]]:
+    """The least and the most seconds that a run with each preset would take here, by what earlier runs measured.
 
     Empty where one of the first photos, which show whether there is a background, cannot be decoded.
     """
     from biresnerf.cores import usable_cores
     from biresnerf.field.backends import resolve_here
-    from biresnerf.forecast import Forecast, remembered_rates
+    from biresnerf.forecast.rates import machine_rates
+    from biresnerf.forecast.run_forecast import Forecast
     from biresnerf.refinement.finish.work_ahead import expect_run
 
-    found: dict[PresetName, float] = {}
+    found: dict[PresetName, tuple[float, float]] = {}
     for preset in PRESETS:
         options, device = resolve_here(asked.model_copy(update={"preset": preset}))
-        forecast = Forecast(remembered_rates(device.type, options.threads or usable_cores()))
+        forecast = Forecast()
         try:
             expect_run(forecast, dataset, options)
         except InputError:  # --pixels says of which photo
             return {}
-        found[preset] = forecast.left_s()
+        found[preset] = machine_rates(device.type, options.threads or usable_cores()).between(forecast.left)
     return found
 
 
@@ -177,12 +178,21 @@ def start_in_words(dataset: Dataset, options: ResolvedOptions) -> str:
     return f"the given poses, or what feature matches make of them where that predicts unseen views better{found}"
 
 
-def in_minutes(seconds: float) -> str:
+def in_minutes(least_s: float, most_s: float) -> str:
     """A predicted time, no more exact than it is."""
+    least, most = _amount_and_unit(least_s), _amount_and_unit(most_s)
+    if least == most:
+        return " ".join(most)
+    return (
+        f"{least[0]} to {' '.join(most)}" if least[1] == most[1] else f"{' '.join(least)} to {' '.join(most)}"
+    )
+
+
+def _amount_and_unit(seconds: float) -> tuple[str, str]:
     if seconds < 55:
-        return f"{max(5, 5 * round(seconds / 5))} s"
+        return f"{max(5, 5 * round(seconds / 5))}", "s"
     minutes = seconds / 60
-    return f"{minutes:.0f} min" if minutes < 90 else f"{minutes / 60:.1f} h"
+    return (f"{minutes:.0f}", "min") if minutes < 90 else (f"{minutes / 60:.1f}", "h")
 
 
 def _lines(found: dict[str, Any]) -> list[str]:
@@ -210,7 +220,7 @@ def _lines(found: dict[str, Any]) -> list[str]:
         f" ({wanted['photo_bytes'] / 2**20:.0f} MiB of pixels)",
     ]
     if wanted["seconds"]:
-        times = (f"{in_minutes(s)} ({preset})" for preset, s in wanted["seconds"].items())
+        times = (f"{in_minutes(*between)} ({preset})" for preset, between in wanted["seconds"].items())
         lines.append("  take about " + ", ".join(times))
     lines += [f"warning: {warning}" for warning in found["warnings"]]
     if asked := found["pose_question"]:

@@ -33,7 +33,7 @@ from biresnerf.field.cuda.check_batch import (
 from biresnerf.field.grid_levels import grid_levels
 from biresnerf.field.radiance_field import FieldRates, FieldShape, Merging, PositionGradient
 from biresnerf.field.reference.field import ReferenceField
-from biresnerf.forecast import cache_folder
+from biresnerf.forecast.rates import cache_folder
 from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam
 from biresnerf.geometry.camera.camera_models import Camera
 

@@ -6,7 +6,7 @@ import time
 from dataclasses import replace
 
 from biresnerf.data.workload import FIRST_ROUND, LEARNING
-from biresnerf.forecast import Phase
+from biresnerf.forecast.run_forecast import Phase
 from biresnerf.refinement.finish.adjust_cameras import adjust_cameras
 from biresnerf.refinement.finish.outcome import Finish
 from biresnerf.refinement.finish.work_ahead import expect_as_measured

@@ -8,7 +8,7 @@ from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.images import load_images
 from biresnerf.data.photos.panoramas.cut_panoramas import as_views
 from biresnerf.data.workload import ADJUSTMENT, after_steps, step_weights, steps_share, workload
-from biresnerf.forecast import Forecast, Phase
+from biresnerf.forecast.run_forecast import Forecast, Phase
 from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refinement.finish.photo_trial import photos_will_be_asked
 from biresnerf.refinement.optimise.methods import find_method

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from biresnerf.data.show.history import History, HistoryLine
 from biresnerf.errors import Interrupted, RefinementError
-from biresnerf.forecast import Phase
+from biresnerf.forecast.run_forecast import Phase
 from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.progress import Monitor, Progress
 from biresnerf.refinement.lost.lost_cameras import LostCameraRepair

@@ -40,8 +40,17 @@ export function duration(seconds: number): string {
 }
 
 /** A predicted time, no more exact than it is. */
-export function roughly(seconds: number): string {
-  if (seconds < 55) return `${Math.max(5, 5 * Math.round(seconds / 5))} s`;
+export const roughly = (seconds: number): string => amountAndUnit(seconds).join(" ");
+
+/** A predicted time of which the least and the most is known. */
+export function roughlyBetween(least: number, most: number): string {
+  const [low, high] = [amountAndUnit(least), amountAndUnit(most)];
+  if (low.join(" ") === high.join(" ")) return high.join(" ");
+  return low[1] === high[1] ? `${low[0]} to ${high.join(" ")}` : `${low.join(" ")} to ${high.join(" ")}`;
+}
+
+function amountAndUnit(seconds: number): [string, string] {
+  if (seconds < 55) return [`${Math.max(5, 5 * Math.round(seconds / 5))}`, "s"];
   const minutes = seconds / 60;
-  return minutes < 90 ? `${minutes.toFixed(0)} min` : `${(minutes / 60).toFixed(1)} h`;
+  return minutes < 90 ? [minutes.toFixed(0), "min"] : [(minutes / 60).toFixed(1), "h"];
 }

@@ -69,7 +69,8 @@ function progressWords(job: JobView): string {
 /** How much of the whole run is done, verdict and files included, and how long the rest takes; or how long it took. */
 export function ProgressBar({ job }: { job: JobView }) {
   const { eta_s, fraction: share } = job.progress;
-  const left = eta_s === null ? "" : `${roughly(eta_s)} left`;
+  const busy = job.metrics.machine_busy ? " (the machine is busy now)" : "";
+  const left = eta_s === null ? "" : `${roughly(eta_s)} left${busy}`;
   if (isOver(job)) return <p class="run-words">{progressWords(job)}</p>;
   return (
     <div>

@@ -1,7 +1,7 @@
 // Preset and options, from the service's description of them.
 import { useMemo } from "preact/hooks";
 import type { CheckReport, FieldProblem, OptionsView } from "schemas";
-import { roughly } from "../../../biresnerf/viewer/widgets/numbers";
+import { roughlyBetween } from "../../../biresnerf/viewer/widgets/numbers";
 import { worded } from "../../../biresnerf/viewer/widgets/option_words";
 import { once, useLoaded } from "../api/hooks";
 import { requestJson } from "../api/http";
@@ -69,7 +69,7 @@ export function OptionsForm({ values, onChange, base, expected = {}, problems = 
             <input type="radio" name="preset" checked={name === preset} onChange={() => set("preset", name)} />
             <strong>{name[0]!.toUpperCase() + name.slice(1)}</strong>
             <span>{PRESET_WORDS[name]}</span>
-            {seconds !== undefined && <span class="preset-time">about {roughly(seconds)} here</span>}
+            {seconds !== undefined && <span class="preset-time">about {roughlyBetween(...seconds)} here</span>}
             <span class="soft">
               {filled.steps} steps at {filled.max_image_size} px ({view.presets_on_gpu[name as keyof OptionsView["presets"]]?.max_image_size} px on a GPU)
             </span>

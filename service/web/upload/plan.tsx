@@ -1,6 +1,6 @@
 // What a job would do with a checked set, in words.
 import type { CheckReport } from "schemas";
-import { count, roughly } from "../../../biresnerf/viewer/widgets/numbers";
+import { count, roughlyBetween } from "../../../biresnerf/viewer/widgets/numbers";
 import type { Values } from "../options/schema";
 
 interface Props {
@@ -29,7 +29,7 @@ export function Plan({ report, values, leftOut }: Props) {
       </ol>
       {seconds !== undefined && !altered && (
         <p>
-          It takes <strong>about {roughly(seconds)}</strong> on this machine, once it is its turn.
+          It takes <strong>about {roughlyBetween(...seconds)}</strong> on this machine after it starts, if nothing else keeps the machine busy.
         </p>
       )}
     </section>

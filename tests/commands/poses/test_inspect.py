@@ -12,7 +12,7 @@ import pytest
 from click.testing import CliRunner
 
 from biresnerf.commands.machine.bench import bench_command
-from biresnerf.commands.poses.inspect import inspect_command
+from biresnerf.commands.poses.inspect import in_minutes, inspect_command
 from biresnerf.commands.poses.make_scene import make_scene_command
 from biresnerf.data.seeding.match_poses import can_match
 from biresnerf.errors import InputError
@@ -113,7 +113,25 @@ def test_bench_measures_both_stages() -> None:
 def test_the_time_of_each_preset_is_predicted_and_longer_ones_take_longer(tmp_path: Path) -> None:
     trajectories.colmap_set(tmp_path)
     seconds = inspected(tmp_path)["plan"]["seconds"]
-    assert 0 < seconds["fast"] < seconds["balanced"] < seconds["quality"]
+    for end in (0, 1):
+        assert 0 < seconds["fast"][end] < seconds["balanced"][end] < seconds["quality"][end]
     assert re.search(
-        r"take about \d+ \w+ \(fast\), ", CliRunner().invoke(inspect_command, [str(tmp_path)]).output
+        r"take about \d+( s)? to \d+ (s|min) \(fast\), ",
+        CliRunner()
+        .invoke(inspect_command, [str(tmp_path)], env={"XDG_CACHE_HOME": str(tmp_path / "new")})
+        .output,
     )
+
+
+@pytest.mark.parametrize(
+    ("least_s", "most_s", "words"),
+    [
+        (95, 95, "2 min"),
+        (20, 45, "20 to 45 s"),
+        (40, 120, "40 s to 2 min"),
+        (190, 350, "3 to 6 min"),
+        (3000, 9000, "50 min to 2.5 h"),
+    ],
+)
+def test_a_time_is_said_no_more_exactly_than_it_is_known(least_s: float, most_s: float, words: str):
+    assert in_minutes(least_s, most_s) == words

@@ -6,7 +6,7 @@ import time
 import pytest
 
 from biresnerf.data.workload import FIRST_ROUND, LEARNING
-from biresnerf.forecast import RATES
+from biresnerf.forecast.run_forecast import RATES
 from biresnerf.refinement.finish.time_budget import LEAST, budget_warnings, choose_steps, keep_to_budget
 from biresnerf.refinement.finish.work_ahead import step_weights, work_ahead
 from biresnerf.refinement.stages.checkpoint import load_checkpoint

@@ -7,7 +7,7 @@ import pytest
 
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.data.workload import FIRST_ROUND, JUDGING, LEARNING, step_weights, workload
-from biresnerf.forecast import Forecast
+from biresnerf.forecast.run_forecast import Forecast
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.similarity import Similarity
 from biresnerf.refinement.finish.work_ahead import expect_as_measured, expect_rest, expect_run, work_ahead

@@ -4,15 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
-from biresnerf.forecast import (
-    RATES,
-    RATES_FILE,
-    TELLING_S,
-    Forecast,
-    cache_folder,
-    remember_rates,
-    remembered_rates,
-)
+from biresnerf.forecast.run_forecast import BUSY_S, RATES, TELLING_S, Forecast
 
 COARSE_S, FINE_S = 0.01, 0.02
 AFTER = {"adjusting": 50.0, "evaluating": 1.0, "judging": 400.0}
@@ -29,18 +21,12 @@ def forecast(**left: float) -> Forecast:
 def passes(monkeypatch) -> Callable[[float], None]:
     """Lets so many seconds pass; without it none do."""
     now = [100.0]
-    monkeypatch.setattr("biresnerf.forecast.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("biresnerf.forecast.run_forecast.time.monotonic", lambda: now[0])
 
     def passes(seconds: float) -> None:
         now[0] += seconds
 
     return passes
-
-
-@pytest.fixture
-def cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    return tmp_path
 
 
 def test_the_steps_and_what_follows_them_are_predicted():
@@ -192,7 +178,7 @@ def test_a_first_step_that_compiles_says_nothing_and_later_ones_count_alike():
 
 def test_time_before_the_run_begins_is_no_part_of_it(monkeypatch):
     clock = [100.0]
-    monkeypatch.setattr("biresnerf.forecast.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr("biresnerf.forecast.run_forecast.time.monotonic", lambda: clock[0])
     found = Forecast({**RATES, "mapped feature": 1.0})
     clock[0] += 900  # kernels are compiled
     found.begins()
@@ -201,35 +187,34 @@ def test_time_before_the_run_begins_is_no_part_of_it(monkeypatch):
     assert found.now() == (0.25, 30)
 
 
-def test_a_machine_remembers_what_its_runs_measured(cache):
-    assert remembered_rates("cpu", 2) == {unit: rate / 2 for unit, rate in RATES.items()}
-    remember_rates("cpu", 2, {"coarse step": 0.1})
-    remember_rates("cpu", 2, {"coarse step": 0.3, "compared feature": 1.0})
-    known = remembered_rates("cpu", 2)
-    assert (known["coarse step"], known["compared feature"]) == (pytest.approx(0.2), 1.0)
-    assert known["mapped feature"] == RATES["mapped feature"] / 2
-    assert remembered_rates("cuda", 2)["compared feature"] == RATES["compared feature"] / 2
+def test_a_run_tells_the_next_what_its_work_takes_while_nobody_else_uses_the_machine(passes):
+    shares = {(100.0, 110.0): 0.25, (110.0, 118.0): 0.5}
+    found = Forecast(RATES, lambda began, ended: shares[began, ended])
+    found.left = {"judging": 400.0}
+    with found.within("judging"):
+        passes(10.0)
+    found.stepped("coarse", 60.0)
+    for seconds in (2.0, 6.0):
+        passes(seconds)
+        found.stepped("coarse", seconds)
+    assert found.measured() == pytest.approx({"trial step": 0.25 * 10.0 / 400, "coarse step": 0.5 * 4.0})
+    assert found.rates["trial step"] == pytest.approx(10.0 / 400), "this run goes on as slowly"
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "{",
-        "[]",
-        '{"cpu 2": 5}',
-        '{"cpu 2": {"compared feature": "slow"}}',
-        '{"cpu 2": {"compared feature": -1.0}}',
-    ],
-)
-def test_a_damaged_memory_is_none(cache, text):
-    (cache_folder() / RATES_FILE).parent.mkdir()
-    (cache_folder() / RATES_FILE).write_text(text)
-    assert remembered_rates("cpu", 2)["compared feature"] == RATES["compared feature"] / 2
-    remember_rates("cpu", 2, {"compared feature": 1.0})
+def test_steps_of_little_work_say_nothing_of_larger_ones_or_of_anything_else():
+    found = forecast(judging=400.0)
+    found.step_weights["coarse"] = 1 / 16
+    for _ in range(3):
+        found.stepped("coarse", 5.0)
+    assert found.seconds("judging") == pytest.approx(400 * RATES["trial step"])
+    assert found.measured() == {}
+    found.plan_steps(10, 0)
+    assert found.seconds("coarse") == pytest.approx(50.0), "but of the steps to come"
 
 
-def test_a_machine_without_room_for_a_memory_runs_all_the_same(cache, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", "/proc/none")
-    remember_rates("cpu", 2, {"compared feature": 1.0})
-    assert remembered_rates("cpu", 2)["compared feature"] == RATES["compared feature"] / 2
+@pytest.mark.parametrize(("share", "busy"), [(0.5, True), (0.9, False)])
+def test_the_machine_is_busy_where_others_take_much_of_the_processor(passes, share: float, busy: bool):
+    asked = []
+    found = Forecast(RATES, lambda began, ended: asked.append((began, ended)) or share)
+    assert found.machine_is_busy() is busy
+    assert asked == [(100.0 - BUSY_S, 100.0)]

@@ -1,20 +1,14 @@
 """How much of a run is done and how long the rest takes: amounts of work, and the seconds that each takes here.
 
-Rates are measured as the run goes and remembered for the next one on the same machine.
+Rates are measured as the run goes; `biresnerf.forecast.rates` remembers them for the next one on the same machine.
 """
 
 from __future__ import annotations
 
-import json
-import logging
-import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Literal
-
-logger = logging.getLogger(__name__)
 
 Phase = Literal[
     "features", "matching", "mapping", "trying", "coarse", "fine", "adjusting", "checking", "evaluating", "judging"
@@ -49,9 +43,13 @@ RATES: dict[Unit, float] = {
 }
 MEMORY = 0.98  # of the running mean of a step's time
 TELLING_S = 2.0  # in less time a small set mostly measures what does not grow with the work
-LEARNING = 0.5  # weight of a run's rates against those remembered
+# Of the lightest step that says something about other work: a lighter one mostly takes what does not grow with it.
+TELLING_WEIGHT = 0.5
 LATE = 0.2  # a phase that takes longer than expected is expected to take this share of its time more
-RATES_FILE = "rates.json"
+BUSY, BUSY_S = (
+    0.67,
+    30.0,
+)  # share of the processor time it could use that a run got in the last seconds, at most
 
 
 class Forecast:
@@ -64,8 +62,14 @@ class Forecast:
         share: of the steps asked for, how many will be taken.
     """
 
-    def __init__(self, rates: Mapping[Unit, float] = RATES) -> None:
+    def __init__(
+        self,
+        rates: Mapping[Unit, float] = RATES,
+        processor_share: Callable[[float, float], float] = lambda _began, _ended: 1.0,
+    ) -> None:
+        """Expect the rates of an idle machine; ``processor_share`` is `ProcessorShare.between`."""
         self.rates, self._expected = dict(rates), dict(rates)
+        self._share = processor_share
         self.left: dict[Phase, float] = {}
         self.step_weights: dict[Phase, float] = {"coarse": 1.0, "fine": 1.0}
         self.share = 1.0
@@ -76,6 +80,7 @@ class Forecast:
         self._later = 0.0  # amount of the phase that is done after other phases
         self._steps: dict[Unit, int] = {}
         self._measured: dict[Unit, float] = {}  # seconds that each rate was measured over
+        self._when: dict[Unit, tuple[float, float]] = {}  # from when to when
         self._fraction = 0.0
 
     def begins(self) -> None:
@@ -118,9 +123,11 @@ class Forecast:
             return
         amount = self.left.pop(self._phase, 0.0)
         if amount > 0:
-            unit, seconds = UNITS[self._phase], time.monotonic() - self._phase_began
+            unit, now = UNITS[self._phase], time.monotonic()
+            seconds = now - self._phase_began
             self.rates[unit] = seconds / amount
             self._measured[unit] = seconds
+            self._when[unit] = self._phase_began, now
             if not self._steps:
                 self._slower = self._slower_so_far()
         self._phase = None
@@ -145,11 +152,14 @@ class Forecast:
         before = self._steps.get(unit, 0)
         self._steps[unit] = before + 1
         if before == 0:
+            self._when[unit] = time.monotonic(), time.monotonic()
             return
-        share = max(1 / before, 1 - MEMORY)
-        self.rates[unit] += share * (seconds / self.step_weights[stage] - self.rates[unit])
+        self._when[unit] = self._when[unit][0], time.monotonic()
+        share, weight = max(1 / before, 1 - MEMORY), self.step_weights[stage]
+        self.rates[unit] += share * (seconds / weight - self.rates[unit])
         self._measured[unit] = self._measured.get(unit, 0.0) + seconds
-        self._slower = self.rates[unit] / self._expected[unit]
+        if weight >= TELLING_WEIGHT:
+            self._slower = self.rates[unit] / self._expected[unit]
 
     def plan_steps(self, coarse: int, fine: int) -> None:
         """So many steps of either stage are left."""
@@ -185,59 +195,27 @@ class Forecast:
         self._fraction = max(self._fraction, min(0.99, spent_s / max(spent_s + left_s, 1e-9)))
         return self._fraction, left_s
 
+    def machine_is_busy(self) -> bool:
+        """Whether others took much of the processor in the last seconds, so that the run is slower than it could be."""
+        now = time.monotonic()
+        return self._share(now - BUSY_S, now) < BUSY
+
     def measured(self, least_s: float = 0.0) -> dict[Unit, float]:
-        """The rates that this run has measured, over at least so many seconds."""
-        return {unit: self.rates[unit] for unit, seconds in self._measured.items() if seconds >= least_s}
+        """The rates that this run has measured over at least so many seconds, as they are on an idle machine.
+
+        Steps that are too light to tell of others are left out.
+        """
+        found: dict[Unit, float] = {}
+        for unit, seconds in self._measured.items():
+            rate = self.rates[unit]
+            if unit in self._steps:
+                weight = next(w for stage, w in self.step_weights.items() if UNITS[stage] == unit)
+                if weight < TELLING_WEIGHT:
+                    continue
+                rate = seconds / (self._steps[unit] - 1) / weight  # of all, as the share of the processor is
+            if seconds >= least_s:
+                found[unit] = rate * self._share(*self._when[unit])
+        return found
 
     def _rate(self, unit: Unit) -> float:
         return self.rates[unit] * (1.0 if unit in self._measured else self._slower)
-
-
-def remembered_rates(device: str, threads: int) -> dict[Unit, float]:
-    """The rates of earlier runs on a kind of device with so many threads; else the general ones."""
-    rates = {unit: rate / threads for unit, rate in RATES.items()}
-    known = _read_rates().get(f"{device} {threads}", {})
-    return rates | {unit: known[unit] for unit in rates if unit in known}
-
-
-def latest_machine() -> tuple[str, int] | None:
-    """The kind of device of the latest run here that was measured, and its threads; None if none was."""
-    names = [name.split(" ") for name in _read_rates()]
-    known = [(name[0], int(name[1])) for name in names if len(name) == 2 and name[1].isdecimal()]
-    return known[-1] if known else None
-
-
-def remember_rates(device: str, threads: int, rates: Mapping[Unit, float]) -> None:
-    """Keep what a run measured, for the next. Where nothing can be written, nothing is kept."""
-    all_rates = _read_rates()
-    known = all_rates.pop(f"{device} {threads}", {})
-    all_rates[f"{device} {threads}"] = known  # the latest comes last
-    for unit, rate in rates.items():
-        known[unit] = rate if unit not in known else known[unit] + LEARNING * (rate - known[unit])
-    path = cache_folder() / RATES_FILE
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f"{RATES_FILE}.{os.getpid()}")
-        temporary.write_text(json.dumps(all_rates, indent=1), "utf-8")
-        temporary.replace(path)
-    except OSError as error:
-        logger.debug("rates are not kept: %s", error)
-
-
-def cache_folder() -> Path:
-    """Where what was found out of this machine is kept."""
-    base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    return Path(base, "biresnerf")
-
-
-def _read_rates() -> dict[str, dict[str, float]]:
-    try:
-        found = json.loads((cache_folder() / RATES_FILE).read_text("utf-8"))
-    except (OSError, ValueError):
-        return {}
-    machines = found if isinstance(found, dict) else {}
-    return {
-        name: {unit: rate for unit, rate in rates.items() if isinstance(rate, float) and rate > 0}
-        for name, rates in machines.items()
-        if isinstance(rates, dict)
-    }

@@ -1,0 +1,1 @@
+"""How long a run takes: what is left of it, and what a machine remembers of its speed. Without torch."""

@@ -1,0 +1,105 @@
+"""The seconds that units of work take on this machine, as its runs measured them: kept from one run to the next."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median_low
+
+from biresnerf.forecast.run_forecast import RATES, UNITS, Phase, Unit
+
+logger = logging.getLogger(__name__)
+
+RATES_FILE = "rates.json"
+# Runs that are remembered; the middle one counts, so that two strange ones say nothing.
+KEPT = 5
+# A rate that is further from the general one is not believed. No general rates of GPUs are known.
+CREDIBLE = 3.0
+# How far general rates may be off: the time on this machine over theirs. Two hosts of the same kind took 2/3 and 3/2.
+UNKNOWN = (2 / 3, 2.0)
+
+
+@dataclass(frozen=True)
+class MachineRates:
+    """Seconds of each unit of work on one machine.
+
+    Attributes:
+        measured: units whose rates were measured there; the others are general ones.
+    """
+
+    seconds: Mapping[Unit, float]
+    measured: frozenset[Unit]
+
+    def between(self, amounts: Mapping[Phase, float]) -> tuple[float, float]:
+        """The least and the most seconds that so much work of each phase takes; the same where all was measured."""
+        known = sum(a * self.seconds[UNITS[p]] for p, a in amounts.items() if UNITS[p] in self.measured)
+        rest = sum(a * self.seconds[UNITS[p]] for p, a in amounts.items()) - known
+        least, most = UNKNOWN
+        return known + least * rest, known + most * rest
+
+
+def machine_rates(device: str, threads: int) -> MachineRates:
+    """Those of a kind of device with so many threads."""
+    general = {unit: rate / threads for unit, rate in RATES.items()}
+    runs = _read().get(f"{device} {threads}", {})
+    known = {unit: median_low(runs[unit]) for unit in general if runs.get(unit)}
+    if device == "cpu":
+        known = {
+            unit: min(max(rate, general[unit] / CREDIBLE), general[unit] * CREDIBLE)
+            for unit, rate in known.items()
+        }
+    return MachineRates(general | known, frozenset(known))
+
+
+def latest_machine(threads: int) -> tuple[str, int]:
+    """The kind of device of the latest run here, and its threads: so many, if any run on that device had so many."""
+    names = [name.split(" ") for name in _read()]
+    known = [(name[0], int(name[1])) for name in names if len(name) == 2 and name[1].isdecimal()]
+    if not known:
+        return "cpu", threads
+    device, _ = known[-1]
+    return (device, threads) if (device, threads) in known else known[-1]
+
+
+def remember_rates(device: str, threads: int, rates: Mapping[Unit, float]) -> None:
+    """Keep what a run measured, for the next. Where nothing can be written, nothing is kept."""
+    machines = _read()
+    known = machines.pop(f"{device} {threads}", {})
+    machines[f"{device} {threads}"] = known  # the latest comes last
+    for unit, rate in rates.items():
+        known[unit] = [*known.get(unit, []), rate][-KEPT:]
+    path = cache_folder() / RATES_FILE
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name(f"{RATES_FILE}.{os.getpid()}")
+        temporary.write_text(json.dumps(machines, indent=1), "utf-8")
+        temporary.replace(path)
+    except OSError as error:
+        logger.debug("rates are not kept: %s", error)
+
+
+def cache_folder() -> Path:
+    """Where what was found out of this machine is kept."""
+    base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return Path(base, "biresnerf")
+
+
+def _read() -> dict[str, dict[str, list[float]]]:
+    try:
+        found = json.loads((cache_folder() / RATES_FILE).read_text("utf-8"))
+    except (OSError, ValueError):
+        return {}
+    machines = found if isinstance(found, dict) else {}
+    return {
+        name: {
+            unit: [rate for rate in rates if isinstance(rate, float) and rate > 0]
+            for unit, rates in runs.items()
+            if isinstance(rates, list)
+        }
+        for name, runs in machines.items()
+        if isinstance(runs, dict)
+    }
