@@ -1,4 +1,4 @@
-# Everything a developer does, in one or two lines each. Needs make and Python 3.11 with its venv module.
+# Everything a developer does, in one or two lines each. Needs make and Python 3.11 or later with its venv module.
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV ?= .venv
@@ -10,6 +10,7 @@ INTERLEAVINGS ?= 1000
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 TOOLS := $(VENV)/tools
+TARGETS ?= lint test
 CONSUMERS := build/consumers
 # Pins for what is installed and, under the names that older and newer pips know, for what builds it.
 CONSTRAINTS ?= constraints.txt
@@ -19,7 +20,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Each process of the tests would compile all modules, and pytest rewrite all assertions, again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup web test test-nightly test-fast test-kernels test-lowest coverage lint format demo serve bench field-check docs docs-site notebooks screenshots fuzz promises audit sbom compose-check slurm-check consumers-check
+.PHONY: help setup web test test-nightly test-fast test-kernels test-lowest test-pythons coverage lint format demo serve bench field-check docs docs-site notebooks screenshots fuzz promises audit sbom compose-check slurm-check consumers-check
 .DELETE_ON_ERROR:
 
 help:  ## what there is
@@ -44,6 +45,9 @@ test-kernels: setup  ## the tests of the CPU kernels, compiled for a processor w
 
 test-lowest: build/lowest.txt  ## all tests with the lowest versions that pyproject.toml allows, in an environment of its own
 	NUMBA_CACHE_DIR=$(CURDIR)/build/lowest-kernels $(MAKE) test test-nightly VENV=.venv-lowest CONSTRAINTS=build/lowest.txt
+
+test-pythons:  ## the tests with each later Python that is found here, in environments of their own; TARGETS="lint test-fast" chooses
+	.ci/pythons $(TARGETS)
 
 build/lowest.txt: pyproject.toml
 	@mkdir -p build
@@ -126,10 +130,10 @@ $(TOOLS): constraints.txt
 
 # Without ensurepip the venv module leaves half an environment behind, so it is looked for first.
 $(BIN)/python:
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' || \
-	  { echo "Python 3.11 is needed; say which with: make PYTHON=/path/to/python" >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "Python 3.11 or later is needed; say which with: make PYTHON=/path/to/python" >&2; exit 1; }
 	@$(PYTHON) -c 'import ensurepip, venv' || \
-	  { echo "Python's venv module is not whole; on Debian: apt install python3.11-venv" >&2; exit 1; }
+	  { echo "Python's venv module is not whole; on Debian: apt install python3-venv" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 
 $(INSTALLED): pyproject.toml $(CONSTRAINTS) | $(BIN)/python

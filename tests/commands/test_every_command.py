@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 
 import click
 import pytest
@@ -10,6 +12,7 @@ from click.testing import CliRunner
 
 from biresnerf import command_line
 from biresnerf.command_line import SECTIONS, Section, cli
+from biresnerf.commands import exit_codes
 from biresnerf.errors import InputError
 from docs.generate.commands_page import ROOT, all_commands
 
@@ -68,3 +71,22 @@ def test_a_command_answers_in_json_and_says_what_each_option_is_for(name: str) -
     for option in options:
         assert not option.hidden, option.name
         assert (option.help or "").strip(), f"{option.name} is not explained"
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["inspect nowhere", "refine nowhere -o out", "evaluate nowhere truth", "convert nowhere out --to kitti",
+     "export nowhere kitti", "view nowhere", "report nowhere", "compare nowhere -o out"],
+)  # fmt: skip
+def test_a_wrong_path_is_answered_before_torch_is_loaded(tmp_path, command: str) -> None:
+    code = (
+        f"import sys; sys.argv[1:] = {command.split()!r}\n"
+        "from biresnerf.command_line import main\n"
+        "try: main()\n"
+        "except SystemExit as end: print(end.code, {'torch', 'numba', 'pycolmap'} & set(sys.modules))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert "nowhere" in done.stderr
+    assert done.stdout == f"{exit_codes.INPUT} set()\n"

@@ -29,7 +29,7 @@ OTHERS = (
     "cp ",
     "cd ",
     "git clone ",
-    "python3.11 -m venv ",
+    "python3 -m venv ",
     ". .venv/bin/activate",
     "mkdir ",
 )

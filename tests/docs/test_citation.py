@@ -40,9 +40,10 @@ def test_all_files_name_one_address():
 
 def test_badges_say_what_the_package_says():
     readme = (ROOT / "README.md").read_text("utf-8")
+    pythons = re.findall(r"Python :: (3\.\d+)", "\n".join(PROJECT["classifiers"]))
     for name, value in {
         "version": PROJECT["version"],
-        "python": "3.11",
+        "python": f"{pythons[0]} to {pythons[-1]}",
         "licence": PROJECT["license"],
     }.items():
         shown = re.search(rf"!\[([^\]]+)\]\(docs/pictures/badge_{name}\.svg\)", readme)

@@ -24,7 +24,7 @@ NOT_RUN = {
     "make ": "develops the project: tests, measurements, tools; CI runs lint, test and demo",
     "git clone": "an address that stands for the project's own",
     ". .venv/bin/activate": "the environment that `make setup` makes",
-    "python3.11 -m venv": "an environment of its own; CI makes one",
+    "python3 -m venv": "an environment of its own; CI makes one",
     "pip install": "changes the environment; CI installs from scratch",
     "docker ": "needs Docker: tests/deploy/compose_check.sh runs the file with podman, as root",
     "TLS_CERTIFICATE=": "needs Docker and a certificate",

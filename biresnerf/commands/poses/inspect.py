@@ -45,10 +45,12 @@ def inspect_command(
     from biresnerf.data.photos.panoramas.cut_panoramas import called_panoramas
     from biresnerf.data.photos.turning_object import turning_notes
     from biresnerf.data.photos.video.video_frames import VideoReading
+
+    dataset = read_dataset(input_path, videos=VideoReading(asked.video_frames))
+    # Loads torch: what is wrong with the input has been said by now.
     from biresnerf.field.backends import resolve_here
 
     options, _ = resolve_here(asked)
-    dataset = read_dataset(input_path, videos=VideoReading(options.video_frames))
     missing_names = sorted(name for name in set(options.fixed) if not dataset.called(name))
     dataset = without_copies(without_photos(dataset, options.leave_out))
     dataset = read_as(dataset, options.given_poses)
