@@ -1,19 +1,29 @@
 """Compile all CPU kernels, or load them from Numba's cache: `python -m biresnerf.compile_kernels`.
 
-Run at install time, it keeps a minute and a half of compilation off the first refinement.
+A run does so in processes of their own, while it reads photos and matches them (`KernelCompilation`). Run at install
+time, it keeps a minute and a half of processor time off the first refinement.
 """
 
 from __future__ import annotations
 
-import logging
+import hashlib
+import subprocess
+import sys
 import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Self
 
+import numba
 import numpy as np
 import torch
+from numba.core import config
 
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.field.backends import directions_for
 from biresnerf.field.cpu.compile_kernels import compile_field_kernels
+from biresnerf.forecast.rates import cache_folder
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.refinement.adjustment.adjustment import adjust_poses, misfit
@@ -25,22 +35,71 @@ from biresnerf.refinement.optimise.cast_rays import cast_rays, viewing_direction
 from biresnerf.refinement.optimise.pixel_chances import PixelChances
 from biresnerf.refinement.parameters.pose_parameters import PoseParameters
 
-logger = logging.getLogger(__name__)
-SLOW_S = 3.0  # loading from the cache takes a fraction of this
 SIZE, BASELINE = 32, 0.125  # px, and as a share of the distance to the scene: four pixels
 
 
-def compile_kernels(*, field: bool = True) -> float:
-    """Every kernel of the adjustment, and of the field unless that runs elsewhere. Returns the seconds it took."""
-    started = time.monotonic()
+class KernelCompilation:
+    """Compiles kernels in other processes, which this one then loads from the cache. A context that ends them."""
+
+    def __init__(self) -> None:
+        self._children: list[subprocess.Popen[bytes]] = []
+        self._field = True
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for child in self._children:
+            child.kill()
+            child.wait()
+
+    def start(self, *, field: bool) -> bool:
+        """Begin, and say whether there is anything to compile. The field's kernels may run elsewhere."""
+        self._field = field
+        if _stamp(field).exists():
+            return False
+        for part in ("render", "rest") if field else ("adjustment",):
+            command = [sys.executable, "-m", "biresnerf.compile_kernels", part]
+            self._children.append(
+                subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+            )
+        return True
+
+    def finish(self, watch: Callable[[], None]) -> float:
+        """Load the kernels once they are compiled; returns the seconds it took. ``watch`` is called while waiting.
+
+        What the other processes could not compile is compiled here.
+        """
+        started = time.monotonic()
+        watch()
+        while any(child.poll() is None for child in self._children):
+            time.sleep(0.1)
+            watch()
+        compile_kernels(field=self._field)
+        return time.monotonic() - started
+
+
+def compile_kernels(*, field: bool = True) -> None:
+    """Every kernel of the adjustment, and of the field unless that runs elsewhere."""
     if field:
         compile_field_kernels()
         _cast_one_ray()
     _adjust_two_cameras()
-    seconds = time.monotonic() - started
-    if seconds > SLOW_S:
-        logger.info("compiled the CPU kernels in %.0f s; later runs load them from the cache", seconds)
-    return seconds
+    with suppress(
+        OSError
+    ):  # without room for it, the next run looks again whether there is something to compile
+        _stamp(field).parent.mkdir(parents=True, exist_ok=True)
+        _stamp(field).touch()
+
+
+def _stamp(field: bool) -> Path:
+    """A file that says that these kernels were compiled here: for this processor, and from these sources."""
+    target = (numba.__version__, sys.version, config.CPU_NAME, config.CPU_FEATURES)  # type: ignore[attr-defined]
+    sources = sorted(
+        (path.as_posix(), path.stat().st_mtime_ns) for path in Path(__file__).parent.rglob("*.py")
+    )
+    key = hashlib.sha256(repr((field, target, sources)).encode()).hexdigest()[:20]
+    return Path(config.CACHE_DIR or cache_folder() / "kernels", f"compiled-{key}")  # type: ignore[attr-defined]
 
 
 def _cast_one_ray() -> None:
@@ -82,6 +141,19 @@ def _adjust_two_cameras() -> None:
     misfit(poses, evidence, NoiseLevels())
 
 
+def _compile_part(part: str) -> None:
+    """Two parts take about as long as each other: ``render``, a field's way forward, and ``rest``."""
+    if part == "render":
+        compile_field_kernels(backward=False)
+        return
+    _adjust_two_cameras()
+    if part == "rest":
+        _cast_one_ray()
+        compile_field_kernels()
+
+
 if __name__ == "__main__":
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
-    compile_kernels()
+    if len(sys.argv) > 1:
+        _compile_part(sys.argv[1])
+    else:
+        compile_kernels()

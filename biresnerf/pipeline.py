@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 
-from biresnerf.compile_kernels import compile_kernels
+from biresnerf.compile_kernels import KernelCompilation
 from biresnerf.data.formats.positions.control_points import control_points
 from biresnerf.data.formats.positions.known_distance import KnownDistance
 from biresnerf.data.formats.positions.position_priors import position_priors
@@ -89,9 +89,9 @@ def refine_poses(
             yet where initial poses were still being looked for.
     """
     started, share = time.monotonic(), ProcessorShare()
-    with share.watching():
+    with share.watching(), KernelCompilation() as kernels:
         setup = _set_up(
-            *(Path(output), options, on_progress, should_stop, share),
+            *(Path(output), options, on_progress, should_stop, share, kernels),
             keep_reusable=keep_reusable,
             overwrite=overwrite,
         )
@@ -148,6 +148,7 @@ class _Setup:
     threads: int
     earlier: Checkpoint | None
     monitor: Monitor
+    kernels: KernelCompilation
 
 
 def _set_up(
@@ -156,11 +157,12 @@ def _set_up(
     on_progress: OnProgress | None,
     should_stop: Callable[[], bool] | None,
     share: ProcessorShare,
+    kernels: KernelCompilation,
     *,
     keep_reusable: bool,
     overwrite: bool,
 ) -> _Setup:
-    """Check the folder, find earlier work in it, and choose the backend, and compile the kernels."""
+    """Check the folder, find earlier work in it, choose the backend, and begin to compile the kernels."""
     folder = OutputFolder(output, keep_reusable=keep_reusable)
     if overwrite:
         folder.remove_result()
@@ -170,11 +172,10 @@ def _set_up(
     threads = use_threads(options.threads)
     forecast = Forecast(machine_rates(device.type, threads).seconds, share.between)
     monitor = Monitor(on_progress or (lambda _progress: None), should_stop or (lambda: False), forecast)
-    message = "loading kernels (the first run compiles them)"
+    first = kernels.start(field=device.type == "cpu")
+    message = "the first run on a machine compiles kernels, beside what follows" if first else ""
     monitor.report(Progress(stage="preparing", message=message, options=options))
-    compile_kernels(field=device.type == "cpu")
-    forecast.begins()
-    return _Setup(folder, asked, options, device, threads, earlier, monitor)
+    return _Setup(folder, asked, options, device, threads, earlier, monitor, kernels)
 
 
 def _read(path: Path, setup: _Setup) -> Dataset:
@@ -223,6 +224,10 @@ def _seed(dataset: Dataset, setup: _Setup) -> tuple[Scene, RunOrigin]:
         seeding.dataset, options.max_image_size, options.background, _photo_counter(len(dataset), setup)
     )
     origin = run_origin(folder.path, dataset, images, options)
+    watch = told_before_the_run(monitor.report, monitor.should_stop)
+    monitor.forecast.pauses(
+        setup.kernels.finish(lambda: watch("loading kernels (compiled once on a machine)"))
+    )
     if earlier is not None:
         refuse_other_run(folder.path, earlier, origin)
         start, tracks = earlier.start, earlier.tracks

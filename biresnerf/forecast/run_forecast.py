@@ -83,9 +83,9 @@ class Forecast:
         self._when: dict[Unit, tuple[float, float]] = {}  # from when to when
         self._fraction = 0.0
 
-    def begins(self) -> None:
-        """What was until now, as the compilation of kernels, is no part of the run: the next one will not have it."""
-        self._began = time.monotonic()
+    def pauses(self, seconds: float) -> None:
+        """What took so long, as the compilation of kernels, is no part of the run: the next will not have it."""
+        self._began += seconds
 
     def continues(self, seconds: float) -> None:
         """The run has taken so long before it was interrupted."""

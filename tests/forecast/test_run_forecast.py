@@ -176,12 +176,12 @@ def test_a_first_step_that_compiles_says_nothing_and_later_ones_count_alike():
     assert set(found.measured()) == {"coarse step"}
 
 
-def test_time_before_the_run_begins_is_no_part_of_it(monkeypatch):
+def test_time_of_a_pause_is_no_part_of_the_run(monkeypatch):
     clock = [100.0]
     monkeypatch.setattr("biresnerf.forecast.run_forecast.time.monotonic", lambda: clock[0])
     found = Forecast({**RATES, "mapped feature": 1.0})
     clock[0] += 900  # kernels are compiled
-    found.begins()
+    found.pauses(900)
     found.left["mapping"] = 30
     clock[0] += 10
     assert found.now() == (0.25, 30)

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import asdict
 
 import click
+from rich.console import Console
 
 from biresnerf.commands import exit_codes
 from biresnerf.commands.answers import json_option, print_json
@@ -29,7 +30,7 @@ def doctor_command(service: str | None, api_key: str | None, as_json: bool) -> i
     With --service, check a running service from outside: address, TLS, readiness, clock, key, version, workers,
     room, and the upload and deletion of three pictures.
     """
-    findings: Iterator[Found] = (check() for check in all_checks())
+    findings = _findings()
     if service is not None:
         with client_extra():
             from biresnerf.commands.machine.service_checks import service_checks
@@ -45,6 +46,16 @@ def doctor_command(service: str | None, api_key: str | None, as_json: bool) -> i
     if as_json:
         print_json({"good": good, "checks": [asdict(result) for result in found]})
     return exit_codes.DONE if good else exit_codes.FAILED
+
+
+def _findings() -> Iterator[Found]:
+    """The checks' results; on a terminal, with a line that says what is being checked."""
+    console = Console(stderr=True)
+    for check in all_checks():
+        first = ": the first run compiles them, for a minute or two" if check.__name__ == "kernels" else ""
+        with console.status(f"checking {check.__name__.strip('<>').replace('_', ' ')}{first}"):
+            found = check()
+        yield found
 
 
 def all_checks() -> Iterator[Check]:
