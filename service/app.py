@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import signal
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager
 
 from fastapi import FastAPI, Request
@@ -14,6 +14,7 @@ from fastapi.responses import Response
 from fastapi.routing import APIRoute
 from starlette.exceptions import HTTPException
 from starlette.routing import Route
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from biresnerf import __version__
 from biresnerf.errors import FaultError
@@ -22,7 +23,6 @@ from service.docs import docs_page
 from service.docs.api_description import describe
 from service.http.access import Access, log_access
 from service.http.dependencies import Service
-from service.http.head_answers import HeadAnswers
 from service.http.metrics import WebMetrics
 from service.http.observe import Observed, is_probe
 from service.http.problems import ProblemError, problem_of
@@ -222,3 +222,38 @@ def _from_http_exception(error: HTTPException) -> ProblemError:
         "method_not_allowed": "This address supports other methods; see the Allow header.",
     }.get(code, str(error.detail))
     return ProblemError(code, detail, headers=dict(error.headers or {}))
+
+
+class _AnsweredError(Exception):
+    """The headers are out: what makes the body, perhaps without end, stops here."""
+
+
+class HeadAnswers:
+    """ASGI middleware around all routes; those that serve HEAD themselves do so."""
+
+    def __init__(self, app: ASGIApp, methods_at: Callable[[str], Sequence[str]]) -> None:
+        self._app, self._methods_at = app, methods_at
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        methods = self._methods_at(scope["path"]) if scope["type"] == "http" else ()
+        if scope.get("method") != "HEAD" or "GET" not in methods or "HEAD" in methods:
+            await self._app(scope, receive, send)
+            return
+        answered = False
+
+        async def send_head(message: Message) -> None:
+            nonlocal answered
+            await send(message)
+            if message["type"] == "http.response.start":
+                await send({"type": "http.response.body", "body": b""})
+                answered = True
+                raise _AnsweredError
+
+        scope["method"] = "GET"
+        try:
+            await self._app(scope, receive, send_head)
+        except Exception:  # ours, perhaps in a group
+            if not answered:
+                raise
+        finally:
+            scope["method"] = "HEAD"

@@ -6,11 +6,38 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from biresnerf.data.synthetic.true_depth import is_made, true_distance
-from biresnerf.geometry.similarity import align_robust
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.synthetic.captures import PHONE_FROM_SCENE, TABLE_METRES, TABLE_SCENE, VASE
+from biresnerf.data.synthetic.scene import MADE_SCENE, SHAPES, render_shapes
+from biresnerf.geometry.similarity import Similarity, align_robust
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.views.evaluation import render_view
+
+_SAME = Similarity.identity()
+_IN_METRES = Similarity(TABLE_METRES, PHONE_FROM_SCENE[:3, :3], np.zeros(3))
+# By the name in the transforms file: the shapes, and where they lie in the world of the file's poses.
+_MADE = {"dome": (SHAPES, _SAME), "vase": (VASE, _SAME), "table": (TABLE_SCENE, _IN_METRES)}
+
+
+def is_made(dataset: Dataset) -> bool:
+    """Whether the set was rendered here, so that its `true_distance` is known."""
+    return dataset.source.document.get(MADE_SCENE) in _MADE
+
+
+def true_distance(
+    dataset: Dataset, world_from_cam: NDArray[np.float64], width: int, height: int, focal: float
+) -> NDArray[np.float64]:
+    """Distance along the ray [height, width] to the nearest surface of a set that `is_made`; infinite where none is.
+
+    In the world's unit, for a pinhole of ``focal`` px centred in the image, at a true pose [4, 4].
+    """
+    shapes, world_from_scene = _MADE[dataset.source.document[MADE_SCENE]]
+    pose = world_from_scene.inverse().apply_to_poses(world_from_cam[None])[0]
+    depth = render_shapes(shapes, (), pose, width, height, focal)[1].astype(np.float64)
+    x = (np.arange(width) + 0.5 - width / 2) / focal
+    y = (np.arange(height) + 0.5 - height / 2) / focal
+    return world_from_scene.scale * depth * np.sqrt(1 + x**2 + y[:, None] ** 2)
 
 
 def depth_error(optimiser: JointOptimiser, scene: Scene, truth: NDArray[np.float64]) -> float | None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import hmac
 import logging
+import math
 import re
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -26,7 +27,6 @@ from service.http.dependencies import Service, service_of
 from service.http.hosts import is_public_name, on_loopback
 from service.http.link_access import LINK_PREFIX, require_shown
 from service.http.problems import ProblemError, problem_of
-from service.http.rate_limits import Allowance, RateLimit
 from workers.datasets.datasets import DatasetStore
 from workers.datasets.uploads import UploadStore
 from workers.jobs.jobs import JobStore
@@ -36,6 +36,7 @@ from workers.settings.settings import Settings
 from workers.tenants.api_keys import ALL_SCOPES, KeyRefused
 from workers.tenants.api_keys import Scope as KeyScope
 from workers.tenants.tenants import LOCAL_TENANT
+from workers.tenants.token_buckets import TokenBuckets
 from workers.webhooks.webhooks import WebhookStore
 
 log = logging.getLogger(__name__)
@@ -54,6 +55,45 @@ REFUSALS = (
 UNIDENTIFIED_PER_S, UNIDENTIFIED_BURST = 1.0, 200
 _BEARER = re.compile(r"Bearer +(\S+) *", re.IGNORECASE)
 _CHALLENGE = 'Bearer realm="biresnerf"'
+
+
+@dataclass(frozen=True)
+class Allowance:
+    """What a client has left. ``wait_s`` is 0 if the request is allowed, else the seconds until the next one is."""
+
+    policy: str
+    limit: int
+    remaining: int
+    full_in_s: int
+    wait_s: int
+
+    def headers(self) -> dict[str, str]:
+        """The headers of draft-ietf-httpapi-ratelimit-headers."""
+        window_s = max(1, self.full_in_s)
+        return {
+            "RateLimit-Policy": f'"{self.policy}";q={self.limit}',
+            "RateLimit": f'"{self.policy}";r={self.remaining};t={window_s}',
+        }
+
+
+@dataclass(frozen=True)
+class RateLimit:
+    """At most ``burst`` requests of one client at once, and ``rate`` a second on average, in all web processes."""
+
+    policy: str
+    rate: float
+    burst: int
+
+    async def take(self, buckets: TokenBuckets, client: str) -> Allowance:
+        """Counts a request, if it is allowed; raises `Unavailable`."""
+        level = await buckets.take(self.policy, client, self.rate, self.burst)
+        return Allowance(
+            policy=self.policy,
+            limit=self.burst,
+            remaining=int(level.tokens),
+            full_in_s=math.ceil(level.full_in_s),
+            wait_s=math.ceil(level.wait_s),
+        )
 
 
 @dataclass(frozen=True)

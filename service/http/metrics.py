@@ -1,16 +1,22 @@
 """Metrics for Prometheus.
 
-Requests and streams are counted by the web processes of one port (`process_metrics`), which is one scrape target.
+Requests and streams are counted by the web processes of one port (`collected`), which is one scrape target.
+prometheus_client keeps their counters in files that all of them read (`PROMETHEUS_MULTIPROC_DIR`, set by
+`service.processes`). Counters of ended processes stay, gauges go.
 Queue, jobs, stages and slots belong to the whole installation and are read from the database at each scrape; every
 replica reports the same, and workers need no port of their own.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, get_args
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, get_args
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
+import psutil
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector
 from prometheus_client.core import (
     CounterMetricFamily,
     GaugeMetricFamily,
@@ -19,11 +25,12 @@ from prometheus_client.core import (
     Metric,
 )
 from prometheus_client.exposition import choose_encoder
+from prometheus_client.multiprocess import MultiProcessCollector, mark_process_dead
 from prometheus_client.registry import Collector
 
 from biresnerf import __version__
 from biresnerf.wire.jobs import EventType
-from service.http import process_metrics
+from service.processes import COUNTERS_VARIABLE
 from workers.database.statistics import Statistics, Tally
 
 _ANSWER_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0)
@@ -78,7 +85,7 @@ class WebMetrics:
     """The metrics that one web process counts."""
 
     def __init__(self) -> None:
-        process_metrics.prepare()
+        forget_predecessor()
         self.registry = CollectorRegistry()
         at = ("method", "route")
         self.requests = self._counter("biresnerf_http_requests", "Requests answered.", *at, "status")
@@ -100,7 +107,7 @@ class WebMetrics:
         return Counter(name, help_text, labels, registry=self.registry)
 
     def _gauge(self, name: str, help_text: str) -> Gauge:
-        return Gauge(name, help_text, registry=self.registry, multiprocess_mode=process_metrics.LIVING)
+        return Gauge(name, help_text, registry=self.registry, multiprocess_mode=LIVING)
 
 
 class Exposition(Collector):
@@ -112,7 +119,7 @@ class Exposition(Collector):
     def collect(self) -> Iterable[Metric]:
         """All metric families."""
         yield InfoMetricFamily("biresnerf_build", "What runs here.", {"version": __version__})
-        yield from process_metrics.collected(self._web.registry)
+        yield from collected(self._web.registry)
         answers = self._installation is not None
         yield GaugeMetricFamily(
             "biresnerf_database_up", "1 while the database answers this process.", answers
@@ -179,3 +186,40 @@ def _histogram(
             buckets.append(("+Inf" if bound == float("inf") else f"{bound:g}", float(below)))
         family.add_metric([value] if label else [], buckets, sum_value=sum(item.amount for item in mine))
     return family
+
+
+# Of gauges: the sum over living processes.
+LIVING: Literal["livesum"] = "livesum"
+
+
+def forget_predecessor() -> None:
+    """Before the first metric is made: a process may get the number of one that ended."""
+    folder = os.environ.get(COUNTERS_VARIABLE)
+    if folder:
+        mark_process_dead(os.getpid(), folder)
+
+
+def collected(registry: CollectorRegistry) -> Iterable[Metric]:
+    """The metrics of this process, or of all that share its port; then those of the system have a label `pid`."""
+    folder = os.environ.get(COUNTERS_VARIABLE)
+    if not folder:
+        return [*registry.collect(), *ProcessCollector(registry=None).collect()]
+    living = []
+    for file in Path(folder).glob(f"gauge_{LIVING}_*.db"):
+        pid = int(file.stem.rpartition("_")[2])
+        if psutil.pid_exists(pid):
+            living.append(pid)
+        else:
+            mark_process_dead(pid, folder)
+    return [*MultiProcessCollector(None, folder).collect(), *_of_system(sorted(living))]
+
+
+def _of_system(pids: list[int]) -> Iterable[Metric]:
+    families: dict[str, Metric] = {}
+    for pid in pids:
+        for found in ProcessCollector(pid=partial(int, pid), registry=None).collect():
+            family = families.setdefault(found.name, Metric(found.name, found.documentation, found.type))
+            family.samples += [
+                sample._replace(labels={**sample.labels, "pid": str(pid)}) for sample in found.samples
+            ]
+    return families.values()

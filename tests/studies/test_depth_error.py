@@ -9,8 +9,7 @@ import torch
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.synthetic.captures import write_vase, write_walk
 from biresnerf.data.synthetic.scene import SHAPES, write_synthetic_scene
-from biresnerf.data.synthetic.true_depth import is_made, true_distance
-from biresnerf.studies.depth_error import depth_error
+from biresnerf.studies.depth_error import depth_error, is_made, true_distance
 from tests.data.synthetic.test_scene import signed_distance
 from tests.refinement.analytic_field import AnalyticField
 from tests.refinement.tiny_scene import given_scene, tiny_optimiser, tiny_options, tiny_set

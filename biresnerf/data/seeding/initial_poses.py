@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import PlainSerializer, PlainValidator
 
-from biresnerf.data.model.dataset import GUESSES
+from biresnerf.data.model.dataset import GUESSES, Dataset
+from biresnerf.data.model.image_order import natural_order
+from biresnerf.geometry.level_ring import level_ring
 from biresnerf.report import PoseSource, TrialReport
 
 MATCHED_SOURCES: frozenset[PoseSource] = frozenset({"colmap", "matches-incremental", "matches-global"})
@@ -81,3 +83,12 @@ class InitialPoses:
     def reliable(self) -> NDArray[np.bool_]:
         """Which poses [n] are as good as any of the set."""
         return ~(self.guessed | self.unmatched)
+
+
+def even_ring(dataset: Dataset) -> InitialPoses:
+    """All images evenly on a level ring about the z axis, in the order of their names."""
+    name: PoseSource = "turntable"
+    count = len(dataset)
+    azimuth = np.empty(count)
+    azimuth[natural_order(dataset.file_names)] = np.arange(count) * (2 * np.pi / count)
+    return InitialPoses(level_ring(azimuth), name, (name,) * count)

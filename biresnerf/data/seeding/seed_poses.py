@@ -20,9 +20,14 @@ from biresnerf.data.photos.orientation import shown_from_cam
 from biresnerf.data.photos.photo_folders import few_names
 from biresnerf.data.photos.turning_object import turning_notes
 from biresnerf.data.seeding.cached_mapping import remembered_mapping
-from biresnerf.data.seeding.compare_models import adds_to, model_lens_problem, with_found_lenses
-from biresnerf.data.seeding.initial_poses import InitialPoses
-from biresnerf.data.seeding.map_images import MappedModel, Mapping
+from biresnerf.data.seeding.initial_poses import InitialPoses, even_ring
+from biresnerf.data.seeding.map_images import (
+    MappedModel,
+    Mapping,
+    adds_to,
+    model_lens_problem,
+    with_found_lenses,
+)
 from biresnerf.data.seeding.match_poses import (
     MatchedPoses,
     can_match,
@@ -31,7 +36,6 @@ from biresnerf.data.seeding.match_poses import (
     without_offset,
 )
 from biresnerf.data.seeding.missing_poses import fill_measured, guess_missing
-from biresnerf.data.seeding.on_turntable import even_ring
 from biresnerf.data.seeding.seeding_progress import OnSeeding
 from biresnerf.errors import FAULTS_RAISE, InputError, RefinementError
 from biresnerf.options.refine_options import SeedingEffort, StartPoses

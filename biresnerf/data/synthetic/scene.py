@@ -17,7 +17,7 @@ from biresnerf.data.synthetic.shapes import Shape, Texture
 CAMERA_DISTANCE = 4.0  # like the NeRF-synthetic sets, as is the angle of view
 CAMERA_ANGLE_X = 0.6911112
 _ELEVATION_RAD = (0.09, 1.30)  # from just above the ground to nearly overhead
-MADE_SCENE = "made_scene"  # key of the transforms file: which shapes were rendered (`true_depth`)
+MADE_SCENE = "made_scene"  # key of the transforms file: which shapes were rendered (`studies/depth_error.py`)
 _SUBSAMPLES = 3  # per pixel and axis; odd, so that one lies in the pixel's centre
 
 # No rotation or mirror maps this onto itself, and no two sides look alike.
@@ -183,7 +183,7 @@ def write_blender_set(
     """Writes the picture of each pose [n, 4, 4] to train/, then transforms.json (Blender dialect); returns its path.
 
     Args:
-        made: the shapes' name, for `true_depth`.
+        made: the shapes' name, for `true_distance`.
         maker: whose cameras take the pictures before a white wall; None: cut out, as PNG. Poses are written for pixels
             as stored.
     """

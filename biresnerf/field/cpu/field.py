@@ -11,10 +11,9 @@ from torch import Tensor
 
 from biresnerf.field.cpu import encoding, network
 from biresnerf.field.cpu import marching as march_kernels
-from biresnerf.field.cpu.harmonics import add_harmonics_gradient, harmonics
 from biresnerf.field.cpu.marching import merge
 from biresnerf.field.cpu.matrix_blocks import CHANNELS, from_tiles
-from biresnerf.field.cpu.ray_gradients import ray_gradients
+from biresnerf.field.cpu.ray_kernels import add_harmonics_gradient, harmonics, ray_gradients
 from biresnerf.field.cpu.samples import Composited, Samples, segments
 from biresnerf.field.cpu.segments import render_segments
 from biresnerf.field.cpu.segments_backward import render_segments_backward

@@ -15,8 +15,6 @@ from torch import Tensor
 
 from biresnerf.field.cuda import plans
 from biresnerf.field.cuda.launches import refuse_the_wrong_mode
-from biresnerf.field.cuda.render_rays import RenderRays
-from biresnerf.field.cuda.sample_count import SampleCount
 from biresnerf.field.cuda.workspace import Capacity, Pass, Workspace
 from biresnerf.field.grid_field import BETA1, BETA2, GridField
 from biresnerf.field.radiance_field import (
@@ -34,6 +32,62 @@ MARGIN = 1.3  # counts change from step to step by less; a step with more leaves
 GROWTH = 1.6  # of what is needed, where buffers have to grow
 BOX_DIAGONAL = 2 * math.sqrt(3)
 RESULTS = ("ray_colour", "opacity", "depth")
+
+
+class SampleCount:
+    """Remembers the last count that has arrived, as samples a ray and unit length of interval."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._on_device = device.type == "cuda"
+        self._arriving = torch.zeros(1, dtype=torch.int32, pin_memory=self._on_device)
+        self._arrived = torch.cuda.Event() if self._on_device else None
+        self._waiting: tuple[int, float] | None = None
+        self._density: float | None = None
+
+    def note(self, total: Tensor, rays: int, interval: float) -> None:
+        """Request the count `total` [1] of this many rays marched at `interval`."""
+        self._arriving.copy_(total, non_blocking=True)
+        if self._arrived is not None:
+            self._arrived.record()
+        self._waiting = (rays, interval)
+
+    def latest(self) -> int:
+        """The count last requested, after waiting for it; 0 if there is none. Call before the next `note`."""
+        if self._arrived is not None and self._waiting is not None:
+            self._arrived.synchronize()
+        count = int(self._arriving)
+        if self._waiting is not None:
+            rays, interval = self._waiting
+            self._density = count * interval / max(1, rays)
+            self._waiting = None
+        return count
+
+    def expected(self, rays: int, interval: float) -> int | None:
+        """The count to expect of other rays, from the last one; None if there is none."""
+        return None if self._density is None else round(self._density * rays / interval)
+
+    def forget(self) -> None:
+        self._waiting = self._density = None
+
+
+class RenderRays(torch.autograd.Function):
+    """Ties the kernels to autograd at the rays, so that poses are optimised like any other torch parameter.
+
+    One of the field's weights is an input so that the backward pass is reached where poses stand still.
+    """
+
+    @staticmethod
+    def forward(ctx, origin, direction, _weight, field: CudaField, rays: Rays):
+        colour, opacity, depth, number = field.run_forward(rays)
+        ctx.kept = (field, number, len(origin), rays.trained)
+        ctx.mark_non_differentiable(depth)
+        return colour, opacity, depth
+
+    @staticmethod
+    def backward(ctx, g_colour, g_opacity, _g_depth):
+        field, number, count, trained = ctx.kept
+        g_origin, g_direction = field.run_backward(number, count, trained, g_colour, g_opacity)
+        return g_origin, g_direction, *(None,) * 3
 
 
 class CudaField(GridField):

@@ -13,7 +13,7 @@ from biresnerf.options.refine_options import RefineOptions
 from tests.workers.conftest import Counting, Slots
 from workers.engine import Stores
 from workers.records import Artifact
-from workers.run.memory import OomKills, smaller_options
+from workers.run.attempt import OomKills, smaller_options
 from workers.settings.settings import Settings
 
 pytestmark = pytest.mark.anyio
@@ -149,7 +149,7 @@ async def test_a_process_killed_while_the_kernel_counts_a_kill_ran_out_of_memory
     counter = tmp_path / "vmstat"
     counter.write_text("oom_kill 4\n")
     program = (
-        "import workers.run.memory as memory, workers.queue.slot as slot, sys, pathlib;"
+        "import workers.run.attempt as memory, workers.queue.slot as slot, sys, pathlib;"
         f"here = pathlib.Path({str(tmp_path)!r});"
         "real = memory.OomKills.__init__;"
         "memory.OomKills.__init__ = lambda self: real(self, here, here);"

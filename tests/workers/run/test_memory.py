@@ -15,7 +15,7 @@ from biresnerf.data.synthetic.scene import write_synthetic_scene
 from biresnerf.errors import Interrupted
 from biresnerf.options.refine_options import RefineOptions, parse_options
 from biresnerf.pipeline import refine_poses
-from workers.run.memory import smaller_options
+from workers.run.attempt import smaller_options
 
 pytestmark = pytest.mark.slow
 
