@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import importlib.util
+import argparse
+import re
 import sys
 import time
+import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks.gpu import gpu_report
+from benchmarks.gpu import report
 from benchmarks.method import peers
 from benchmarks.speed.clock import timed
 from biresnerf.data.model.dataset import Dataset, Frame, SourceFormat
@@ -19,7 +21,6 @@ from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.studies.scenes import with_poses
 from tests.data.scenes import textured_arc
-from tests.docs.forms_of_commands import check_shell
 
 pytestmark = pytest.mark.slow
 
@@ -58,25 +59,54 @@ def test_colmap_on_a_rendered_arc_is_measured_against_its_truth(tmp_path):
     assert len(peers.table(lines).splitlines()) == 3
 
 
-def test_a_gpu_report_holds_what_each_command_printed_and_how_it_ended(tmp_path, monkeypatch):
-    works, fails = (sys.executable, "-c", "print(6 * 7)"), (sys.executable, "-c", "raise SystemExit(3)")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(gpu_report, "commands", lambda _work: [works, fails, ("no-such-program",)])
-    gpu_report.main()
-    parts = (tmp_path / "gpu-report.txt").read_text().split("$ ")[1:]
-    for part, expected in zip(
-        parts, ("42\n\nexit status 0", "exit status 3", "exit status not there"), strict=True
+def reported(monkeypatch: pytest.MonkeyPatch, out: Path, *arguments: str) -> list[str]:
+    """The parts of a report: each a line with its name and how it ended, its command, and what that printed."""
+    monkeypatch.setattr(sys, "argv", ["report", "--out", str(out), "--device", "cpu", *arguments])
+    report.main()
+    return re.split(r"^## (?=\w+: (?:exit|not) )", out.read_text(), flags=re.M)[1:]
+
+
+def test_a_gpu_report_goes_on_whatever_happens_to_a_part(tmp_path, monkeypatch):
+    python = (sys.executable, "-c")
+    planned = [
+        report.Part("works", (*python, "print(6 * 7)"), 60),
+        report.Part("fails", (*python, "print('so far'); raise SystemExit(3)"), 60),
+        report.Part("hangs", (*python, "import time; print('so far', flush=True); time.sleep(60)"), 3),
+        report.Part("lacks", ("no-such-program",), 60),
+        report.Part("crashes", (*python, "import os; os.abort()"), 60),
+    ]
+    monkeypatch.setattr(report, "parts", lambda _asked, _work: planned)
+    ended = ("works: exit status 0", "fails: exit status 3", "hangs: not done after 3 s", "lacks: not there")
+    said = ("42\n", "so far\n", "so far\n", "no-such-program", "")
+    for part, end, text in zip(
+        reported(monkeypatch, tmp_path / "r.txt"), (*ended, "crashes: exit status -6"), said, strict=True
     ):
-        assert expected in part
+        assert part.startswith(end)
+        assert text in part
 
 
-def test_the_commands_of_a_gpu_report_are_there(tmp_path):
-    for command in gpu_report.commands(tmp_path):
-        words = list(command)
-        if words[0] == sys.executable:
-            assert importlib.util.find_spec(words[2]) is not None
-        elif words[0] != "nvidia-smi":
-            assert Path(words[0]).is_file()
-            check_shell(" ".join(["biresnerf", *words[1:]]))
-        for path in (word for word in words if word.startswith("tests/")):
-            assert (Path(__file__).parents[1] / path).exists()
+def test_a_report_made_on_a_cpu_has_a_scene_and_the_error_of_its_run(tmp_path, monkeypatch):
+    quick = ("steps=40", "max_image_size=32", "start=given", "verdict=false")
+    asked = (
+        "--parts",
+        "scene,runs",
+        "--presets",
+        "fast",
+        "--views",
+        "8",
+        *(word for s in quick for word in ("--set", s)),
+    )
+    scene, run = reported(monkeypatch, tmp_path / "r.txt", *asked)
+    assert scene.startswith("scene: exit status 0")
+    assert "8 views" in scene
+    assert run.startswith("runs: exit status 0")
+    assert re.search(r"\| made \| noise 0.15 \| default \| \d+\.\d+ ", run)
+
+
+def test_wheels_stand_in_for_what_is_missing(tmp_path):
+    with zipfile.ZipFile(tmp_path / "carried-1-py3-none-any.whl", "w") as wheel:
+        wheel.writestr("carried_for_this_test.py", "print('found')")
+    asked = argparse.Namespace(wheels=tmp_path, device="cuda")
+    variables = report.environment(asked, tmp_path / "work")
+    part = report.Part("any", (sys.executable, "-c", "import carried_for_this_test, biresnerf"), 60)
+    assert report.run(part, variables) == ("exit status 0", "found\n")

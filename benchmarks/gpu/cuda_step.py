@@ -1,7 +1,12 @@
-"""One optimisation step of the field on a GPU: the Triton kernels against the plain-torch definition."""
+"""One optimisation step of the field on a GPU: the Triton kernels against the plain-torch definition.
+
+``python -m benchmarks.gpu.cuda_step`` prints a JSON line for each stage; with ``--profile``, where a step's time goes.
+"""
 
 from __future__ import annotations
 
+import argparse
+import json
 import statistics
 import time
 
@@ -81,3 +86,27 @@ def run(rays: int, rounds: int) -> list[dict[str, float | str | int]]:
             }
         )
     return rows
+
+
+def profile(rays: int) -> str:
+    """Kernels of stage 2 by their time on the device, as torch's profiler sees 20 steps."""
+    from torch.profiler import ProfilerActivity
+    from torch.profiler import profile as watch
+
+    shape = FieldShape(grid_levels(3, 16, 72, 22), grid_levels(LEVELS, 128, 4096, 19), unbounded=False)
+    field, occupied = CudaField(shape, 0, DEVICE), _shell()
+    field.start_reconstruction()
+    _steps(field, rays, 3, occupied)
+    with watch(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA]) as seen:
+        _steps(field, rays, 20, occupied)
+    return seen.key_averages().table(sort_by="cuda_time_total", row_limit=25)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--profile", action="store_true")
+    if parser.parse_args().profile:
+        print(profile(8192))
+    else:
+        for row in run(8192, 5):
+            print(json.dumps(row))

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _UNITS = {"h": "hours", "d": "days", "w": "weeks"}
 
 
-class Span(click.ParamType[timedelta]):
+class Span(click.ParamType):
     """Text such as 12h, 90d or 4w."""
 
     name = "span"

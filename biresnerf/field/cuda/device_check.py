@@ -199,4 +199,5 @@ def _computed(make: MakeField, device: torch.device, *, unbounded: bool) -> dict
 if __name__ == "__main__":
     from biresnerf.field.cuda.field import CudaField
 
-    print(json.dumps(faults(CudaField, torch.device("cuda"))))  # noqa: T201
+    # On the CPU, Triton's interpreter runs the kernels (TRITON_INTERPRET=1).
+    print(json.dumps(faults(CudaField, torch.device(*sys.argv[1:] or ["cuda"]))))  # noqa: T201
