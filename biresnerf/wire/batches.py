@@ -54,7 +54,9 @@ class BatchView(Record):
     finished_at: datetime | None = Field(None, description="When its last job ended; null before.")
     counts: dict[JobState, int] = Field(examples=[{"running": 1, "succeeded": 1}])
     jobs: tuple[BatchJob, ...] = Field(description="In the order of the request, but for deleted ones.")
-    links: BatchLinks = Field(default_factory=lambda fields: BatchLinks.below(batch_url(fields["id"])))
+    links: BatchLinks = Field(
+        default_factory=lambda fields: BatchLinks.below(batch_url(fields.get("id", "")))
+    )
 
     @property
     def final(self) -> bool:

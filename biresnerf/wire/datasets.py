@@ -86,7 +86,9 @@ class DatasetView(Record):
         description="When its files are deleted unless it is used; null while a job uses it, or if they are kept.",
     )
     revision: int = Field(0, examples=[63])
-    links: DatasetLinks = Field(default_factory=lambda fields: DatasetLinks.below(dataset_url(fields["id"])))
+    links: DatasetLinks = Field(
+        default_factory=lambda fields: DatasetLinks.below(dataset_url(fields.get("id", "")))
+    )
 
 
 class DatasetList(Page[DatasetView]):

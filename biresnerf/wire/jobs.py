@@ -158,9 +158,10 @@ class JobView(Record):
     )
     labels: dict[str, str] = Field({}, examples=[{"run": "a"}])
     revision: int = Field(0, examples=[17])
+    # Before 2.14, pydantic calls this for fields that failed, too.
     links: JobLinks = Field(
         default_factory=lambda fields: JobLinks.below(
-            job_url(fields["id"]), dataset=dataset_url(fields["dataset_id"])
+            job_url(fields.get("id", "")), dataset=dataset_url(fields.get("dataset_id", ""))
         )
     )
 

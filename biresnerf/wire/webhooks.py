@@ -87,7 +87,7 @@ class WebhookView(Record):
     created_at: datetime
     links: WebhookLinks = Field(
         default_factory=lambda fields: WebhookLinks.below(
-            webhook_url(fields["id"]), rotate=f"{webhook_url(fields['id'])}/secret"
+            webhook_url(fields.get("id", "")), rotate=f"{webhook_url(fields.get('id', ''))}/secret"
         )
     )
 
@@ -124,7 +124,9 @@ class DeliveryView(Record):
     )
     attempts: tuple[WebhookAttempt, ...] = ()
     links: DeliveryLinks = Field(
-        default_factory=lambda fields: DeliveryLinks.below(delivery_path(fields["webhook_id"], fields["id"]))
+        default_factory=lambda fields: DeliveryLinks.below(
+            delivery_path(fields.get("webhook_id", ""), fields.get("id", ""))
+        )
     )
 
 
