@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import errno
 import gzip
+import io
 import os
 import stat
 import struct
+import sys
 import tarfile
 import zipfile
 import zlib
@@ -30,6 +32,16 @@ RATIO_FREE_BYTES = 16 * 2**20
 _METHODS = {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}
 _ENCRYPTED = 0x1 | 0x40
 _TAR_BLOCK = 512
+# What a zip's table of contents may take for an entry: its fixed part, a path of 900 bytes, and some extra fields.
+_ENTRY_BYTES = 1200
+# What a tar may put before an entry (a long path, attributes), or say for all entries in sum: tarfile takes time by the
+# square of the one, before Python 3.11.10 and 3.12.6, and copies the other for each entry.
+_HEAD_BYTES = 2**14
+_HEADS = {
+    *(tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK, tarfile.SOLARIS_XHDTYPE),
+    tarfile.XHDTYPE,
+    tarfile.XGLTYPE,
+}
 _PACK_HINT = "Pack plain files and folders only, as zip, tar or tar.gz."
 
 
@@ -57,7 +69,7 @@ def unpack(request: UnpackRequest) -> dict[str, Any]:
             head = file.read(265)
             file.seek(0)
             if head[:4] in {b"PK\x03\x04", b"PK\x05\x06"}:
-                _unpack_zip(file, sink)
+                _unpack_zip(sink)
             elif head[:2] == b"\x1f\x8b":
                 with gzip.GzipFile(fileobj=file) as plain:
                     _unpack_tar(plain, sink)
@@ -67,7 +79,14 @@ def unpack(request: UnpackRequest) -> dict[str, Any]:
                 raise sink.rejected("This is not a zip, tar or tar.gz archive.", hint=_PACK_HINT)
     except (zipfile.BadZipFile, tarfile.TarError, EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise sink.rejected(f"The archive is broken: {error}.") from None
-    except (NotImplementedError, ValueError, OverflowError, IndexError, struct.error) as error:
+    except (
+        NotImplementedError,
+        ValueError,
+        OverflowError,
+        IndexError,
+        RecursionError,
+        struct.error,
+    ) as error:
         raise sink.rejected(f"The archive is damaged or of an unknown kind: {error}.") from None
     except OSError as error:
         if error.errno != errno.EINVAL:  # a place before the file's start, which the archive names
@@ -93,13 +112,14 @@ class _Sink:
         ratio_bytes = int(request.archive.stat().st_size * request.ratio_max)
         self.budget = min(request.bytes_max, max(ratio_bytes, RATIO_FREE_BYTES))
         self._by_ratio = self.budget < request.bytes_max
+        # Folders count too: they also use inodes.
+        self.entries_max = 2 * request.files_max + 64
 
     def entry(self, name: str) -> str | None:
         """The safe path of the next entry; None for files that an operating system added."""
         self.current = name.encode("unicode_escape").decode()[:300]
         self._entries += 1
-        # Folders count too: they also use inodes.
-        if self._entries > 2 * self.request.files_max + 64:
+        if self._entries > self.entries_max:
             raise self._too_many()
         path = checked_path(name)
         return None if is_litter(path) else path
@@ -151,8 +171,22 @@ class _Sink:
         )
 
 
-def _unpack_zip(file: IO[bytes], sink: _Sink) -> None:
-    with zipfile.ZipFile(file) as archive:
+class _ZipBytes(io.BufferedReader):
+    """A zip's bytes, at most so many at once: zipfile reads the table of contents as a whole."""
+
+    most = sys.maxsize
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        if size is not None and size > self.most:
+            raise MemoryError
+        return super().read(size)
+
+
+def _unpack_zip(sink: _Sink) -> None:
+    with _ZipBytes(io.FileIO(sink.request.archive)) as content:
+        content.most = sink.entries_max * _ENTRY_BYTES
+        archive = zipfile.ZipFile(content)
+        content.most = sys.maxsize
         for info in archive.infolist():
             # zipfile truncates names at NUL and replaces separators; check the original name.
             path = sink.entry(info.orig_filename.removesuffix("/") if info.is_dir() else info.orig_filename)
@@ -168,13 +202,14 @@ def _unpack_zip(file: IO[bytes], sink: _Sink) -> None:
                     f"The entry is packed by method {info.compress_type}.",
                     hint="Use deflate.",
                 )
-            with archive.open(info) as content:
-                sink.write(path, content)
+            with archive.open(info) as plain:
+                sink.write(path, plain)
 
 
 def _unpack_tar(plain: IO[bytes] | gzip.GzipFile, sink: _Sink) -> None:
     counted = _CountedReader(plain, sink)
-    with tarfile.open(fileobj=counted, mode="r|", bufsize=_TAR_BLOCK * 128) as archive:  # type: ignore[call-overload]
+    options: Any = {"mode": "r|", "bufsize": _TAR_BLOCK * 128, "tarinfo": _member_of(sink)}
+    with tarfile.open(fileobj=counted, **options) as archive:  # type: ignore[call-overload]
         for member in _members(archive):
             path = sink.entry(member.name)
             if member.isdir():
@@ -193,6 +228,25 @@ def _unpack_tar(plain: IO[bytes] | gzip.GzipFile, sink: _Sink) -> None:
         pass
     if counted.tail.strip(b"\0") or len(counted.tail) < _TAR_BLOCK:
         raise sink.rejected("The archive is cut short: its end mark is missing.")
+
+
+def _member_of(sink: _Sink) -> type[tarfile.TarInfo]:
+    """An entry of this archive, whose heads are refused before they are read where they are too long."""
+    heads, for_all = sink.entries_max * _ENTRY_BYTES, _HEAD_BYTES
+
+    class Member(tarfile.TarInfo):
+        def _proc_member(self, archive: tarfile.TarFile) -> tarfile.TarInfo:
+            nonlocal heads, for_all
+            if self.type in _HEADS:
+                heads -= self.size
+                for_all -= self.size if self.type == tarfile.XGLTYPE else 0
+                if self.size > _HEAD_BYTES or min(heads, for_all) < 0:
+                    raise sink.rejected(
+                        "What the archive says of its entries is unreasonably long.", _PACK_HINT
+                    )
+            return super()._proc_member(archive)  # type: ignore[misc]
+
+    return Member
 
 
 def _members(archive: tarfile.TarFile) -> Iterator[tarfile.TarInfo]:

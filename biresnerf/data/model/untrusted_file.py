@@ -68,7 +68,8 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         if key in result:
             beside = result.get("file_path")
             raise _DuplicateKeyError(
-                f"the key {key!r} stands twice in one object" + (f" (of {beside!r})." if beside else ".")
+                f"the key {repr(key)[:100]} stands twice in one object"
+                + (f" (of {repr(beside)[:100]})." if beside else ".")
             )
         result[key] = value
     return result
@@ -76,22 +77,26 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def first_non_finite(value: Any, path: str = "") -> str | None:
     """The path (``frames[3].transform_matrix[0][1]``) of the first NaN or infinite number, or None."""
+    found = _first_non_finite(value)
+    return None if found is None else f"{path}{found}".removeprefix(".")
+
+
+def _first_non_finite(value: Any) -> str | None:
     if isinstance(value, float):
-        return None if math.isfinite(value) else path
+        return None if math.isfinite(value) else ""
     if isinstance(value, dict):
-        items = [(f"{path}.{key}" if path else key, item) for key, item in value.items()]
+        for key, item in value.items():
+            if (found := _first_non_finite(item)) is not None:
+                return f".{key}{found}"
     elif isinstance(value, list):
-        items = [(f"{path}[{index}]", item) for index, item in enumerate(value)]
-    else:
-        return None
-    for item_path, item in items:
-        if isinstance(item, float | dict | list) and (found := first_non_finite(item, item_path)):
-            return found
+        for index, item in enumerate(value):
+            if (found := _first_non_finite(item)) is not None:
+                return f"[{index}]{found}"
     return None
 
 
-# A string, which may hold slashes, or a comment; an open one goes on to the end.
-_STRING_OR_COMMENT = re.compile(r'"(?:\\.|[^"\\])*"|//[^\n]*|/\*.*?(?:\*/|\Z)', re.DOTALL)
+# A string, which may hold slashes, or a comment. An open one goes on to the end: it is not looked at again.
+_STRING_OR_COMMENT = re.compile(r'"(?:\\.|[^"\\])*(?:"|\Z)|//[^\n]*|/\*.*?(?:\*/|\Z)', re.DOTALL)
 
 
 def _parsed(text: str) -> Any:
@@ -161,7 +166,7 @@ def refuse_non_finite(value: Any, file: str, place: str = "") -> None:
         raise InputError(
             "pose_not_finite",
             "NaN or an infinite number.",
-            where=f"{file} {found}",
+            where=f"{file} {found[:300]}",
             hint="Remove the frame, or its transform_matrix, or export it again.",
         )
 

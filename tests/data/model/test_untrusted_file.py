@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
+import time
 
 import pytest
 from hypothesis import given, settings
@@ -93,3 +95,31 @@ def test_the_first_number_that_is_not_finite_is_named_by_its_path():
     document = {"a": 1, "frames": [{"m": [[0.0, 1.0]]}, {"m": [[0.0, math.nan]]}]}
     assert first_non_finite(document) == "frames[1].m[0][1]"
     assert first_non_finite({"a": [1.0, "NaN"]}) is None
+
+
+LONG = {
+    "a string without end in a file with comments": lambda n: '{"a": 1 // b\n "' + '\\"' * n,
+    "comments without end": lambda n: "{" + "/* " * n,
+    "a long key above many numbers": lambda n: json.dumps({"k" * n: [0.5] * n}),
+    "many brackets": lambda n: '{"a": [' + "[], " * n,
+}
+
+
+@pytest.mark.parametrize("case", LONG)
+def test_the_time_for_a_file_grows_as_its_size(file, case):
+    def processor_s(n):
+        file.write_text(LONG[case](n), "utf-8")
+        begun = time.process_time()
+        with contextlib.suppress(InputError):
+            read_json_object(file)
+        return time.process_time() - begun
+
+    assert processor_s(100_000) < 25 * processor_s(10_000) + 0.25
+
+
+def test_an_error_repeats_no_more_than_the_start_of_what_it_names(file):
+    for text in ('{"%s": 1, "%s": 2}' % (("k" * 10**6,) * 2), '{"%s": NaN}' % ("k" * 10**6)):
+        file.write_text(text)
+        with pytest.raises(InputError) as caught:
+            read_json_object(file)
+        assert len(caught.value.detail + caught.value.where) < 1000

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import io
+import struct
 import tarfile
+import time
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -131,3 +134,58 @@ def test_a_damaged_table_of_contents_is_the_archives_fault(
     with pytest.raises(InputError) as caught:
         unpack(request(damaged(tmp_path, find, at, change)))
     assert caught.value.code == "archive_rejected"
+
+
+def zip_of_entries(n: int, extra: bytes = b"") -> bytes:
+    """A zip with one file, which a table of contents of ``n`` entries calls by many names."""
+    local = struct.pack("<IHHHHHIIIHH", 0x04034B50, 20, 0, 0, 0, 0x21, 0, 0, 0, 1, 0) + b"0"
+    table = b"".join(
+        struct.pack(
+            "<IHHHHHHIIIHHHHHII", 0x02014B50, *(20, 20, 0, 0, 0, 0x21, 0, 0, 0), 7, len(extra), *(0,) * 5
+        )
+        + b"%07d" % number
+        + extra
+        for number in range(n)
+    )
+    wide = struct.pack("<IQHHIIQQQQ", 0x06064B50, 44, 45, 45, 0, 0, n, n, len(table), len(local))
+    where = struct.pack("<IIQI", 0x07064B50, 0, len(local) + len(table), 1)
+    end = struct.pack("<IHHHHIIH", 0x06054B50, 0, 0, 0xFFFF, 0xFFFF, 0xFFFFFFFF, 0xFFFFFFFF, 0)
+    return local + table + wide + where + end
+
+
+def tar_entry(kind: bytes, content: bytes = b"") -> bytes:
+    entry = tarfile.TarInfo("x")
+    entry.type, entry.size = kind, len(content)
+    return entry.tobuf(tarfile.USTAR_FORMAT) + content + bytes(-len(content) % 512)
+
+
+def said_for_all(n: int) -> bytes:
+    """``n`` attributes that hold for each of the entries behind them."""
+    said = tar_entry(tarfile.XGLTYPE, b"".join(b"16 k%07d=abc\n" % number for number in range(n)))
+    return said + tar_entry(tarfile.DIRTYPE) * (n // 10)
+
+
+UNREASONABLE: dict[str, Callable[[int], bytes]] = {
+    "a zip of many entries": zip_of_entries,
+    "a zip of many extra fields": lambda n: zip_of_entries(n // 1000, b"\xfe\xca\0\0" * 16_000),
+    "a tar with much said for all": said_for_all,
+    "a tar with a long head": lambda n: tar_entry(tarfile.XHDTYPE, b"9" * n) + tar_entry(tarfile.REGTYPE),
+    "a tar with a head of heads": lambda n: tar_entry(tarfile.XHDTYPE, b"13 k=abcdefg\n") * n,
+    "a tar of long names": lambda n: tar_entry(tarfile.GNUTYPE_LONGNAME, b"a" * n) * 10,
+}
+
+
+@pytest.mark.parametrize("case", UNREASONABLE)
+def test_an_archive_that_says_too_much_of_its_entries_is_refused_before_that_is_read(
+    tmp_path: Path, case: str
+):
+    def processor_s(n: int) -> float:
+        (tmp_path / f"{n}").mkdir()
+        (tmp_path / f"{n}/archive").write_bytes(UNREASONABLE[case](n).ljust(2048, b"\0"))
+        begun = time.process_time()
+        with pytest.raises(InputError) as refused:
+            unpack(request(tmp_path / f"{n}/archive", files_max=1000))
+        assert refused.value.code == "archive_rejected"
+        return time.process_time() - begun
+
+    assert processor_s(200_000) < 4 * processor_s(20_000) + 0.25
