@@ -8,8 +8,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-import torch
-
 from biresnerf.compile_kernels import KernelCompilation
 from biresnerf.data.formats.positions.control_points import control_points
 from biresnerf.data.formats.positions.known_distance import KnownDistance
@@ -30,11 +28,12 @@ from biresnerf.field.backends import resolve_here, use_threads
 from biresnerf.forecast.processor_share import ProcessorShare
 from biresnerf.forecast.rates import machine_rates, remember_rates
 from biresnerf.forecast.run_forecast import TELLING_S, Forecast
-from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
+from biresnerf.options.refine_options import RefineOptions
 from biresnerf.progress import Monitor, OnProgress, Progress, told_before_the_run
 from biresnerf.refinement.finish.rounds import run_stage_2
 from biresnerf.refinement.finish.time_budget import keep_to_budget
 from biresnerf.refinement.finish.work_ahead import expect_rest, expect_run
+from biresnerf.refinement.optimise.methods import Method, Recipe
 from biresnerf.refinement.parameters.rigid_bodies import rigid_bodies
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.checkpoint import SEEDING, TRACKS, Checkpoint, RunOrigin
@@ -64,6 +63,7 @@ def refine_poses(
     should_stop: Callable[[], bool] | None = None,
     observer: Observer | None = None,
     *,
+    method: Method | None = None,
     keep_reusable: bool = False,
     overwrite: bool = False,
 ) -> Report:
@@ -79,6 +79,7 @@ def refine_poses(
         should_stop: asked after every step, view, frame and photo; once true, a checkpoint and a partial result are
             written.
         observer: looks into the run, for comparisons with the truth.
+        method: in place of the one that the options name, e.g. ``dataclasses.replace(BIRESNERF, repair=False)``.
         keep_reusable: leave in `output`/checkpoint what other runs of the set can start from.
         overwrite: remove a finished result from `output` first.
 
@@ -89,24 +90,23 @@ def refine_poses(
             yet where initial poses were still being looked for.
     """
     started, share = time.monotonic(), ProcessorShare()
+    folder = OutputFolder(Path(output), keep_reusable=keep_reusable)
+    if overwrite:
+        folder.remove_result()
     with share.watching(), KernelCompilation() as kernels:
-        setup = _set_up(
-            *(Path(output), options, on_progress, should_stop, share, kernels),
-            keep_reusable=keep_reusable,
-            overwrite=overwrite,
-        )
+        setup = _set_up(folder, options, method, on_progress, should_stop, share, kernels)
         return _refine(input, setup, observer, started)
 
 
 def _refine(input: str | Path | Dataset, setup: _Setup, observer: Observer | None, started: float) -> Report:
     dataset = input if isinstance(input, Dataset) else _read(Path(input), setup)
-    dataset = without_copies(without_photos(dataset, setup.options.leave_out), setup.options.fixed)
+    dataset = without_copies(without_photos(dataset, setup.asked.leave_out), setup.asked.fixed)
     dataset = with_shared_predictions(dataset)
     dataset = _as_meant(dataset, setup)
     dataset = replace(dataset, positions=position_priors(dataset), control=control_points(dataset))
     scene, origin = _seed(dataset, setup)
     stages = _first_step(scene, origin, setup, observer)
-    keep_to_budget(stages, started, setup.options.steps)
+    keep_to_budget(stages, started, setup.recipe.options.steps)
     stages.record.seconds["preparing"] = time.monotonic() - started
 
     evaluation, judgement = Evaluation(), None
@@ -127,7 +127,7 @@ def _refine(input: str | Path | Dataset, setup: _Setup, observer: Observer | Non
         report = run_report(stages, evaluation.scores, judgement, "partial", so_far=so_far)
         write_result(setup.folder, stages, evaluation, report, so_far)
         raise
-    remember_rates(setup.device.type, setup.threads, setup.monitor.forecast.measured(TELLING_S))
+    remember_rates(setup.recipe.device.type, setup.recipe.threads, setup.monitor.forecast.measured(TELLING_S))
     return report
 
 
@@ -136,36 +136,29 @@ class _Setup:
     """What is known before anything is read.
 
     Attributes:
-        asked, options: as the user gave them, and resolved for this machine.
-        threads: used on the CPU.
+        asked: the options as the user gave them.
+        recipe: with the options resolved for this machine.
         earlier: work of another run that this one continues.
     """
 
     folder: OutputFolder
     asked: RefineOptions
-    options: ResolvedOptions
-    device: torch.device
-    threads: int
+    recipe: Recipe
     earlier: Checkpoint | None
     monitor: Monitor
     kernels: KernelCompilation
 
 
 def _set_up(
-    output: Path,
+    folder: OutputFolder,
     asked: RefineOptions,
+    method: Method | None,
     on_progress: OnProgress | None,
     should_stop: Callable[[], bool] | None,
     share: ProcessorShare,
     kernels: KernelCompilation,
-    *,
-    keep_reusable: bool,
-    overwrite: bool,
 ) -> _Setup:
     """Check the folder, find earlier work in it, choose the backend, and begin to compile the kernels."""
-    folder = OutputFolder(output, keep_reusable=keep_reusable)
-    if overwrite:
-        folder.remove_result()
     folder.refuse_finished()
     earlier = earlier_work(folder.path)
     options, device = resolve_here(asked)
@@ -175,13 +168,13 @@ def _set_up(
     first = kernels.start(field=device.type == "cpu")
     message = "the first run on a machine compiles kernels, beside what follows" if first else ""
     monitor.report(Progress(stage="preparing", message=message, options=options))
-    return _Setup(folder, asked, options, device, threads, earlier, monitor, kernels)
+    return _Setup(folder, asked, Recipe.of(options, device, threads, method), earlier, monitor, kernels)
 
 
 def _read(path: Path, setup: _Setup) -> Dataset:
     watch = told_before_the_run(setup.monitor.report, setup.monitor.should_stop)
-    videos = VideoReading(setup.options.video_frames, watch)
-    return read_dataset(path, strict=setup.options.bad_frames == "refuse", videos=videos)
+    videos = VideoReading(setup.asked.video_frames, watch)
+    return read_dataset(path, strict=setup.asked.bad_frames == "refuse", videos=videos)
 
 
 def _as_meant(dataset: Dataset, setup: _Setup) -> Dataset:
@@ -189,7 +182,7 @@ def _as_meant(dataset: Dataset, setup: _Setup) -> Dataset:
 
     Panoramas are cut into views.
     """
-    options = setup.options
+    options = setup.asked
     dataset = read_as(dataset, options.given_poses)
     if options.panoramas == "all":
         dataset = called_panoramas(dataset)
@@ -204,10 +197,11 @@ def _as_meant(dataset: Dataset, setup: _Setup) -> Dataset:
 
 def _seed(dataset: Dataset, setup: _Setup) -> tuple[Scene, RunOrigin]:
     """The set with initial poses for all its images: those of earlier work, else those that predict photos best."""
-    options, folder, earlier, monitor = setup.options, setup.folder, setup.earlier, setup.monitor
+    recipe, folder, earlier, monitor = setup.recipe, setup.folder, setup.earlier, setup.monitor
+    options = recipe.options
     bodies = rigid_bodies(dataset, options)  # refuses unknown names before anything takes time
     KnownDistance.of(options.known_distance, dataset)  # so does this
-    expect_run(monitor.forecast, dataset, options)
+    expect_run(monitor.forecast, dataset, recipe)
     with SeedingPreview(dataset, folder, monitor) as preview:
         seeding = seed_poses(
             dataset,
@@ -223,7 +217,7 @@ def _seed(dataset: Dataset, setup: _Setup) -> tuple[Scene, RunOrigin]:
     images = load_images(
         seeding.dataset, options.max_image_size, options.background, _photo_counter(len(dataset), setup)
     )
-    origin = run_origin(folder.path, dataset, images, options)
+    origin = run_origin(folder.path, dataset, images, recipe)
     watch = told_before_the_run(monitor.report, monitor.should_stop)
     monitor.forecast.pauses(
         setup.kernels.finish(lambda: watch("loading kernels (compiled once on a machine)"))
@@ -234,9 +228,7 @@ def _seed(dataset: Dataset, setup: _Setup) -> tuple[Scene, RunOrigin]:
     else:
         folder.path.mkdir(parents=True, exist_ok=True)
         tracks = Tracks.load(folder.path / TRACKS, dataset.names)
-        start = find_start(
-            seeding.candidates, seeding.dataset, images, tracks, options, setup.device, setup.threads, monitor
-        )
+        start = find_start(seeding.candidates, seeding.dataset, images, tracks, recipe, monitor)
     held_out = held_out_views(len(dataset), options.holdout, start.reliable)
     return Scene(seeding.dataset, images, start, held_out, tracks), origin
 
@@ -250,17 +242,17 @@ def _photo_counter(count: int, setup: _Setup) -> Callable[[int], None]:
 
 def _first_step(scene: Scene, origin: RunOrigin, setup: _Setup, observer: Observer | None) -> TwoStages:
     """The stages before their first step, or where earlier work ended."""
-    options = stage_lengths(scene.start, setup.asked, setup.options)
+    recipe = stage_lengths(scene.start, setup.asked, setup.recipe)
     setup.monitor.report(
         Progress(
             stage="seeding" if origin.seeding is not None else "preparing",
             message=f"{len(scene.dataset)} images read",
-            options=options,
+            options=recipe.options,
             reusable=reusable_seeding(setup.folder.path) if setup.earlier is None else {},
         )
     )
     observer = replace(observer or Observer(), write_preview=partial(write_preview, setup.folder))
-    optimiser = first_step(scene, options, setup.device, setup.threads)
+    optimiser = first_step(scene, recipe)
     stages = TwoStages(optimiser, scene, setup.folder.path, origin, setup.monitor, observer)
     if setup.earlier is not None:
         stages.restore(setup.earlier)

@@ -11,7 +11,9 @@ from biresnerf.data.model.atomic_file import whole_file
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.errors import InputError
-from biresnerf.options.refine_options import RESULT_OPTIONS, STAGE_1_OPTIONS, ResolvedOptions
+from biresnerf.options.refine_options import RESULT_OPTIONS, STAGE_1_OPTIONS
+from biresnerf.refinement.optimise.method_changes import differences
+from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.stages.checkpoint import (
     COARSE,
     OTHER_FOLDER,
@@ -39,8 +41,8 @@ def earlier_work(folder: Path) -> Checkpoint | None:
     return earlier
 
 
-def run_origin(folder: Path, dataset: Dataset, images: ImageSet, options: ResolvedOptions) -> RunOrigin:
-    """What identifies a run: its photos at working size, given poses, and options.
+def run_origin(folder: Path, dataset: Dataset, images: ImageSet, recipe: Recipe) -> RunOrigin:
+    """What identifies a run: its photos at working size, given poses, options and method.
 
     Args:
         dataset: as it was given, before poses were found.
@@ -52,7 +54,8 @@ def run_origin(folder: Path, dataset: Dataset, images: ImageSet, options: Resolv
 
     def fingerprint(names: frozenset[str]) -> str:
         digest = photos.copy()
-        content: list[Any] = [options.model_dump(include=set(names)), dataset.names, given]
+        options = recipe.options.model_dump(include=set(names))
+        content: list[Any] = [options, differences(recipe), dataset.names, given]
         digest.update(json.dumps(content, sort_keys=True).encode())
         return digest.hexdigest()
 

@@ -25,6 +25,7 @@ from biresnerf.field.radiance_field import PositionGradient
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.options.refine_options import parse_options
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.scene.scene_frame import scene_frame
 from biresnerf.studies.baselines.methods import BARF_HIDDEN, BARF_SAMPLES
 from biresnerf.studies.baselines.mlp_field import LAYERS, POSITION_BANDS, SKIP, VIEW_BANDS, MlpField
@@ -144,9 +145,8 @@ def main() -> None:
     noisy = perturb_poses(dataset.world_from_cam, NOISE, seed=1)
     frame = scene_frame(noisy, images)
     options = parse_options({"preset": "fast", "method": "barf", "max_image_size": SIZE}).resolved("cpu")
-    optimiser = JointOptimiser(
-        images, frame, frame.unit_from_world.apply_to_poses(noisy), options, [], torch.device("cpu"), 1
-    )
+    recipe = Recipe.of(options, torch.device("cpu"), 1)
+    optimiser = JointOptimiser(images, frame, frame.unit_from_world.apply_to_poses(noisy), recipe, [])
     generator = torch.Generator().manual_seed(0)
     image = torch.randint(IMAGES, (RAYS,), generator=generator)
     xy = torch.randint(SIZE, (RAYS, 2), generator=generator) + 0.5

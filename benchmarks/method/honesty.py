@@ -14,8 +14,6 @@ import argparse
 import json
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,6 +24,7 @@ from benchmarks.method.seeding import shrunk, with_focal
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.formats.simple.poses_json import POSES, matrix_of, read_poses_json
 from biresnerf.data.model.dataset import GUESSES, Dataset
+from biresnerf.data.model.part_of_set import without_copies
 from biresnerf.data.model.refined_set import REFINED
 from biresnerf.data.photos.guessed_lens import GUESSED_FOCAL
 from biresnerf.data.points.tracks import Tracks
@@ -37,6 +36,7 @@ from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_robust
 from biresnerf.options.refine_options import parse_options
 from biresnerf.pipeline import refine_poses
+from biresnerf.refinement.stages.checkpoint import SEEDING, TRACKS
 from biresnerf.report import ImageReport, Report
 from biresnerf.studies.scenes import with_poses
 
@@ -122,26 +122,21 @@ def with_foreign_photos(dataset: Dataset, others: Dataset) -> Dataset:
     )
 
 
-@contextmanager
-def wrong_tracks(share: float, seed: int) -> Iterator[None]:
-    """Within it, this share of the observations of tracks lies at random places of other observations."""
-    load = Tracks.load
+def match_wrongly(given: Dataset, output: Path, share: float, seed: int) -> None:
+    """Leave COLMAP's answer where a run of the set finds it, with this share of the observations at random places.
 
-    def loaded(path: Path, names: tuple[str, ...]) -> Tracks | None:
-        tracks = load(path, names)
-        if tracks is None:
-            return None
-        rng = np.random.default_rng(seed)
-        wrong = np.flatnonzero(rng.random(len(tracks)) < share)
-        xy = tracks.xy.copy()
-        xy[wrong] = tracks.xy[rng.permutation(wrong)]
-        return replace(tracks, xy=xy)
-
-    Tracks.load = staticmethod(loaded)  # type: ignore[method-assign]
-    try:
-        yield
-    finally:
-        Tracks.load = load  # type: ignore[method-assign]
+    These are the places of other observations.
+    """
+    matched = without_copies(given, ())
+    seed_poses(matched, seed=seed, remember=output / SEEDING)
+    tracks = Tracks.load(output / TRACKS, matched.names)
+    if tracks is None:
+        return
+    rng = np.random.default_rng(seed)
+    wrong = np.flatnonzero(rng.random(len(tracks)) < share)
+    xy = tracks.xy.copy()
+    xy[wrong] = tracks.xy[rng.permutation(wrong)]
+    np.savez(output / TRACKS, names=np.array(matched.names), **replace(tracks, xy=xy).kept())
 
 
 def errors_deg(poses: Array, truth: Array, placed: NDArray[np.bool_]) -> Array:
@@ -190,11 +185,10 @@ def run(
     asked = parse_options(
         {"preset": "fast", "seed": seed, "max_image_size": FIELD_PX, "orbit_frames": 0, **options}
     )
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        wrong_tracks(0.3 if start == "wrong matches" else 0.0, seed),
-    ):
+    with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "out"
+        if start == "wrong matches":
+            match_wrongly(given, output, 0.3, seed)
         report = refine_poses(given, output, asked)
         before, result = poses_in(output, report)
         refined = poses_in(output / REFINED, report)[1] if (output / REFINED).exists() else result

@@ -12,6 +12,7 @@ from biresnerf.data.synthetic.scene import render_synthetic, synthetic_cameras, 
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.refinement.optimise.joint_optimiser import OCCUPANCY_PERIOD, JointOptimiser
+from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.scene.scene_frame import scene_frame
 
 CPU = torch.device("cpu")
@@ -49,7 +50,7 @@ def untrained(
     photo_set, poses = photos(images, size), synthetic_cameras(VIEWS, SEED)[np.arange(images) % VIEWS]
     frame = scene_frame(poses, photo_set)
     start = frame.unit_from_world.apply_to_poses(poses)
-    return JointOptimiser(photo_set, frame, start, options, [], device, threads)
+    return JointOptimiser(photo_set, frame, start, Recipe.of(options, device, threads), [])
 
 
 @cache

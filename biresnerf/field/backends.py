@@ -114,26 +114,30 @@ def camera_kernels(device: torch.device) -> ModuleType | None:
     return poses_and_rays
 
 
-def make_field(shape: FieldShape, seed: int, device: torch.device, threads: int) -> RadianceField:
+def make_field(
+    shape: FieldShape, options: ResolvedOptions, device: torch.device, threads: int
+) -> RadianceField:
     """The fastest backend for the device: Numba kernels on the CPU, Triton kernels on CUDA.
 
-    Plain torch replaces kernels that did not pass their check on this GPU.
+    Plain torch where the options ask for it, and in place of kernels that did not pass their check on this GPU.
     """
     field: RadianceField
-    if device.type == "cpu":
-        from biresnerf.field.cpu.field import CpuField
-
-        field = CpuField(shape, seed, device, threads)
-    elif faults := gpu_faults(device):
+    faults = gpu_faults(device)
+    if options.field == "reference" or faults:
         from biresnerf.field.reference.field import ReferenceField
 
-        logger.warning(
-            "using plain torch: the CUDA kernels did not pass their check on this GPU (%s)", faults[0]
-        )
-        field = ReferenceField(shape, seed, device)
+        if faults:
+            logger.warning(
+                "using plain torch: the CUDA kernels did not pass their check on this GPU (%s)", faults[0]
+            )
+        field = ReferenceField(shape, options.seed, device)
+    elif device.type == "cpu":
+        from biresnerf.field.cpu.field import CpuField
+
+        field = CpuField(shape, options.seed, device, threads)
     else:
         from biresnerf.field.cuda.field import CudaField
 
-        field = CudaField(shape, seed, device)
+        field = CudaField(shape, options.seed, device)
     logger.info("field backend %s on %s, %d threads", field.backend, device, threads)
     return field

@@ -65,6 +65,10 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
         "biresnerf",
         description="biresnerf-paper: the two stages as published; the last three: other published methods.",
     )
+    field: Annotated[Literal["kernels", "reference"], Option("coarse", "Field", level="research")] = Field(
+        "kernels",
+        description="What computes a field of grids. reference: plain torch, many times slower, to try changes.",
+    )
     device: Annotated[DeviceName, Option("coarse", "Compute on", level="usual")] = Field(
         AUTO, description="Where to compute; auto: on a CUDA GPU if there is one."
     )

@@ -6,17 +6,21 @@ import signal
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.photos.video.video_frames import VideoReading
 from biresnerf.openmp import let_waiting_threads_sleep
+from biresnerf.options.presets import MethodName
 from biresnerf.options.refine_options import parse_options
 from biresnerf.progress import OnProgress, told_before_the_run
 from biresnerf.result import Result, load
 from biresnerf.run.photos_added import joined_to
 from biresnerf.run.show_progress import ShownProgress
 from biresnerf.run.stop_request import StopRequest
+
+if TYPE_CHECKING:
+    from biresnerf.refinement.optimise.methods import Method
 
 
 def refine(
@@ -28,6 +32,7 @@ def refine(
     should_stop: Callable[[], bool] | None = None,
     overwrite: bool = False,
     fixed_from: str | Path | None = None,
+    method: MethodName | Method = "biresnerf",
     **options: Any,
 ) -> Result:
     """Refine the camera poses of an image set, as the command ``biresnerf refine`` does.
@@ -44,6 +49,7 @@ def refine(
             written. Without it, Ctrl-C asks for the same, as does a notebook's stop button.
         fixed_from: a finished result of some of the photos: these keep its poses and lenses, and the others join them.
         overwrite: remove a finished result from `output` first.
+        method: the option of that name, or a method of your own (docs/method.md).
         options: of the refinement, by name, as docs/options.md lists them: ``preset="fast", steps=2000``.
 
     Returns:
@@ -57,7 +63,8 @@ def refine(
             initial poses were still being looked for.
     """
     let_waiting_threads_sleep()
-    asked = parse_options(options)
+    own = None if isinstance(method, str) else method
+    asked = parse_options(options if own else {"method": method, **options})
     with ExitStack() as during:
         on_progress = during.enter_context(ShownProgress()) if progress is True else progress or None
         stop = should_stop or during.enter_context(StopRequest(signal.SIGINT))
@@ -68,5 +75,5 @@ def refine(
             dataset, asked = joined_to(dataset, asked, Path(fixed_from))
         from biresnerf.pipeline import refine_poses  # loads torch, which takes seconds
 
-        refine_poses(dataset, output, asked, on_progress, stop, overwrite=overwrite)
+        refine_poses(dataset, output, asked, on_progress, stop, method=own, overwrite=overwrite)
     return load(output)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, JsonValue
 
 from biresnerf.frozen_model import FrozenModel
 from biresnerf.geometry.pose_error import PoseError
@@ -64,16 +65,20 @@ class Cell(FrozenModel):
     scene: Scene
     start: Perturbation
     options: RefineOptions
+    method: dict[str, JsonValue] = Field(
+        default_factory=dict, description="What differs from the method that the options name, by its fields."
+    )
     equal_time: EqualTime | None = None
 
     @property
     def key(self) -> str:
-        """Hash of everything that may change the result: scene content, start, and options with presets filled in."""
+        """Hash of all that may change the result: scene content, start, method, and options with presets filled in."""
         content = [
             self.scene.model_dump_json(exclude={"name", "file", "test_file"}),
             self.start.model_dump_json(),
             self.options.device,
             self.options.resolved("cpu").model_dump_json(exclude={"device", "checkpoint_every_s"}),
+            json.dumps(self.method, sort_keys=True),
         ]
         return hashlib.sha256("\n".join(content).encode()).hexdigest()[:12]
 

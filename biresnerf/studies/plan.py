@@ -15,11 +15,20 @@ from biresnerf.studies.run_cells import finished, run_in_child
 
 # At equal time a variant's speed is measured by a probe, then by a run of about this share of the time.
 PROBE_STEPS, CALIBRATION_SHARE = 20, 0.1
+OF_METHOD = "method."  # before the names of its fields, among settings
+
+
+def options_of(settings: dict[str, Any]) -> dict[str, Any]:
+    """The settings that are options of a refinement."""
+    return {key: value for key, value in settings.items() if not key.startswith(OF_METHOD)}
 
 
 @dataclass(frozen=True)
 class Variant:
-    """A named set of options; `settings` override those that all variants share."""
+    """A named set of options; `settings` override those that all variants share.
+
+    ``method.FIELD`` among them is a field of the method, e.g. ``{"method.repair": False}``.
+    """
 
     name: str
     settings: dict[str, Any]
@@ -45,14 +54,26 @@ class Plan:
 
         By default the run's seed is that of the noise. It starts from the perturbed poses without feature matches,
         renders no orbit, returns the refined poses without a verdict, and holds out no views of a scene that has test
-        views. Raises `InputError`.
+        views. Raises `InputError` for options and for changes of the method.
         """
         defaults: dict[str, Any] = {"seed": start.seed, "start": "given", "orbit_frames": 0, "verdict": False}
         if scene.test_file is not None:
             defaults["holdout"] = 0
-        options = parse_options({**defaults, **self.settings, **variant.settings})
+        options = parse_options({**defaults, **options_of(self.settings), **options_of(variant.settings)})
         options.resolved("cpu")  # raises for invalid combinations before anything runs
+        if changes := self.method_changes(variant):
+            from biresnerf.refinement.optimise.method_changes import changed  # loads torch
+            from biresnerf.refinement.optimise.methods import find_method
+
+            changed(find_method(options.method), changes)
         return options
+
+    def method_changes(self, variant: Variant) -> dict[str, Any]:
+        """What of the variant's method differs from the one that its options name."""
+        given = {**self.settings, **variant.settings}
+        return {
+            key.removeprefix(OF_METHOD): value for key, value in given.items() if key.startswith(OF_METHOD)
+        }
 
 
 @dataclass(frozen=True)
@@ -106,7 +127,12 @@ def run_plan(plan: Plan, run: Callable[[Cell, str], CellResult]) -> list[Entry]:
         first: CellResult | None = None
         for variant in plan.variants:
             title = f"{scene.name}, {start.label}, seed {start.seed}: {variant.name}"
-            cell = Cell(scene=scene, start=start, options=plan.options(variant, scene, start))
+            cell = Cell(
+                scene=scene,
+                start=start,
+                options=plan.options(variant, scene, start),
+                method=plan.method_changes(variant),
+            )
             if plan.equal_time and first is not None:
                 result = _run_in_same_time(cell, first, run, title)
             else:
@@ -125,11 +151,8 @@ def _run_in_same_time(
     seconds = first.outcome.optimisation_s
     steps, ms_per_step = PROBE_STEPS, 0.0
     while True:
-        short = Cell(
-            scene=cell.scene.model_copy(update={"test_file": None, "test_views": 0}),
-            start=cell.start,
-            options=with_steps(cell.options, steps),
-        )
+        untested = cell.scene.model_copy(update={"test_file": None, "test_views": 0})
+        short = cell.model_copy(update={"scene": untested, "options": with_steps(cell.options, steps)})
         calibration = run(short, f"{title}, {steps} steps to measure its speed")
         if calibration.outcome is None:
             return CellResult(cell=cell, error=f"calibration failed: {calibration.error}")
@@ -141,9 +164,7 @@ def _run_in_same_time(
         steps = longer
     fitting = max(PROBE_STEPS, round(1000 * seconds / ms_per_step / 10) * 10)
     equal = EqualTime(seconds=seconds, calibration_steps=steps, calibration_ms_per_step=round(ms_per_step, 3))
-    whole = Cell(
-        scene=cell.scene, start=cell.start, options=with_steps(cell.options, fitting), equal_time=equal
-    )
+    whole = cell.model_copy(update={"options": with_steps(cell.options, fitting), "equal_time": equal})
     return run(whole, f"{title}, {fitting} steps")
 
 

@@ -24,6 +24,8 @@ from biresnerf.geometry.pose_error import PoseError, camera_errors, pose_error
 from biresnerf.geometry.similarity import align_by_spread, align_robust
 from biresnerf.pipeline import refine_poses
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.optimise.method_changes import changed
+from biresnerf.refinement.optimise.methods import find_method
 from biresnerf.refinement.stages.checkpoint import CHECKPOINT
 from biresnerf.refinement.stages.observer import Observer
 from biresnerf.refinement.stages.two_stages import TwoStages
@@ -134,6 +136,7 @@ def run_cell(folder: Path, should_stop: Callable[[], bool]) -> CellResult:
         cell.options,
         should_stop=should_stop,
         observer=Observer(observer.at_check, observer.at_end),
+        method=changed(find_method(cell.options.method), cell.method),
     )
     # Measure what a user would receive: the poses read back from the file.
     refined = np.stack(list(read_poses(run / "transforms.json").values()))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from biresnerf.options.refine_options import parse_options
-from biresnerf.studies.plan import Variant
+from biresnerf.studies.plan import Variant, options_of
 
 RESOLUTIONS = (32, 48, 64, 72, 96, 128, 256, 512, 1024, 4096)
 LEVELS = (1, 2, 3, 4, 6, 8, 16)
@@ -36,13 +36,13 @@ class Study:
 
 def _stage_1_only(given: dict[str, Any]) -> dict[str, Any]:
     """All steps belong to the pose-estimation module."""
-    steps = parse_options(given).resolved("cpu").steps
+    steps = parse_options(options_of(given)).resolved("cpu").steps
     return {**given, "steps": steps, "coarse_steps_min": steps, "coarse_steps_max": steps}
 
 
 def _same_switch(given: dict[str, Any]) -> dict[str, Any]:
     """Stage 2 begins at the cap in all variants, so that their curves differ only from there on."""
-    options = parse_options(given).resolved("cpu")
+    options = parse_options(options_of(given)).resolved("cpu")
     return {
         **given,
         "steps": options.steps,

@@ -10,10 +10,11 @@ import pytest
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.errors import InputError
+from biresnerf.refinement.optimise.methods import BIRESNERF, Method
 from biresnerf.refinement.stages.checkpoint import COARSE, SEEDING, TRACKS, RunOrigin, save_checkpoint
 from biresnerf.resume import earlier_work, refuse_other_run, reusable_seeding, run_origin
 from tests.refinement.stages.test_checkpoint import checkpoint
-from tests.refinement.tiny_scene import tiny_options, tiny_set
+from tests.refinement.tiny_scene import tiny_recipe, tiny_set
 
 pytestmark = pytest.mark.slow
 
@@ -25,11 +26,12 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     return tiny_set(tmp_path_factory.mktemp("scene"))
 
 
-def origin(folder: Path, scene: Scene, **changed: object) -> RunOrigin:
-    return run_origin(folder, *scene, tiny_options(**changed))
+def origin(folder: Path, scene: Scene, method: Method | None = None, **changed: object) -> RunOrigin:
+    return run_origin(folder, *scene, tiny_recipe(method, **changed))
 
 
 def test_options_that_change_no_result_leave_the_origin_as_it_is(scene: Scene, tmp_path: Path):
+    assert origin(tmp_path, scene, BIRESNERF) == origin(tmp_path, scene)
     changed = {"threads": 1, "checkpoint_every_s": 1.0, "orbit_frames": 9}
     assert origin(tmp_path, scene, **changed) == origin(tmp_path, scene)
 

@@ -16,6 +16,7 @@ from biresnerf.data.synthetic.scene import write_synthetic_scene
 from biresnerf.errors import Interrupted
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.optimise.methods import Method, Recipe
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.scene.scene_frame import scene_frame
 from biresnerf.refinement.stages.two_stages import TwoStages
@@ -52,6 +53,11 @@ def tiny_options(**changed) -> ResolvedOptions:
     return tiny_run(**changed).resolved("cpu")
 
 
+def tiny_recipe(method: Method | None = None, **changed) -> Recipe:
+    """These, and how they are trained here."""
+    return Recipe.of(tiny_options(**changed), CPU, 2, method)
+
+
 def tiny_set(folder: Path, views: int = 7, size: int = 24) -> tuple[Dataset, ImageSet]:
     """The synthetic scene with true poses, read back."""
     dataset = read_dataset(write_synthetic_scene(folder, views, size, seed=3))
@@ -59,11 +65,15 @@ def tiny_set(folder: Path, views: int = 7, size: int = 24) -> tuple[Dataset, Ima
 
 
 def tiny_optimiser(
-    dataset: Dataset, images: ImageSet, options: RefineOptions, held_out: list[int] | None = None
+    dataset: Dataset,
+    images: ImageSet,
+    options: ResolvedOptions,
+    held_out: list[int] | None = None,
+    method: Method | None = None,
 ) -> JointOptimiser:
     frame = scene_frame(dataset.world_from_cam, images)
     start = frame.unit_from_world.apply_to_poses(dataset.world_from_cam)
-    return JointOptimiser(images, frame, start, options, held_out or [], CPU, threads=2)
+    return JointOptimiser(images, frame, start, Recipe.of(options, CPU, 2, method), held_out or [])
 
 
 def given_scene(

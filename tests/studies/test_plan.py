@@ -55,6 +55,24 @@ def test_a_key_is_of_what_decides_the_result():
     assert len({cell().key, *(other.key for other in others)}) == 6
 
 
+def test_a_change_of_the_method_makes_another_cell_and_reaches_it_by_name():
+    made = plan(
+        Variant("whole", {}), Variant("no repair", {"method.repair": False, "pose_rate": 0.01}),
+        settings={**FAST, "method.by_detail": 0}, seeds=(1,),
+    )  # fmt: skip
+    cells: list[Cell] = []
+    run_plan(
+        made, lambda wanted, _title: cells.append(wanted) or CellResult(cell=wanted, outcome=outcome(0.01))
+    )
+    assert [each.method for each in cells[:2]] == [{"by_detail": 0}, {"by_detail": 0, "repair": False}]
+    assert [each.options.pose_rate for each in cells[:2]] == [None, 0.01]
+    assert cell(method={"repair": False}).key != cell().key
+    with pytest.raises(InputError, match="no field of the method"):
+        plan(Variant("wrong", {"method.repairs": False})).options(
+            Variant("wrong", {"method.repairs": False}), scene(), Perturbation()
+        )
+
+
 def test_a_scene_with_test_views_has_all_others_optimised():
     tested = scene().model_copy(update={"test_file": Path("transforms_test.json"), "test_views": 5})
     made = plan(Variant("a", {}))

@@ -66,6 +66,7 @@ def measured(options: RefineOptions, folder: Path, steps: int, views: int, size:
     from biresnerf.field.backends import resolve_here, use_threads
     from biresnerf.geometry.perturb import perturb_poses
     from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+    from biresnerf.refinement.optimise.methods import Recipe
     from biresnerf.refinement.scene.scene_frame import scene_frame
 
     resolved, device = resolve_here(options)
@@ -78,7 +79,7 @@ def measured(options: RefineOptions, folder: Path, steps: int, views: int, size:
     poses = perturb_poses(dataset.world_from_cam, 0.05, 1)
     frame = scene_frame(poses, images)
     start = frame.unit_from_world.apply_to_poses(poses)
-    optimiser = JointOptimiser(images, frame, start, resolved, [], device, threads)
+    optimiser = JointOptimiser(images, frame, start, Recipe.of(resolved, device, threads), [])
     stages = []
     for name in ("coarse", "fine"):
         if name == "fine":

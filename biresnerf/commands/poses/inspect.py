@@ -134,16 +134,17 @@ def expected_seconds(dataset: Dataset, asked: RefineOptions) -> dict[PresetName,
     from biresnerf.forecast.rates import machine_rates
     from biresnerf.forecast.run_forecast import Forecast
     from biresnerf.refinement.finish.work_ahead import expect_run
+    from biresnerf.refinement.optimise.methods import Recipe
 
     found: dict[PresetName, tuple[float, float]] = {}
     for preset in PRESETS:
         options, device = resolve_here(asked.model_copy(update={"preset": preset}))
-        forecast = Forecast()
+        threads, forecast = options.threads or usable_cores(), Forecast()
         try:
-            expect_run(forecast, dataset, options)
+            expect_run(forecast, dataset, Recipe.of(options, device, threads))
         except InputError:  # --pixels says of which photo
             return {}
-        found[preset] = machine_rates(device.type, options.threads or usable_cores()).between(forecast.left)
+        found[preset] = machine_rates(device.type, threads).between(forecast.left)
     return found
 
 

@@ -11,7 +11,7 @@ from biresnerf.data.workload import ADJUSTMENT, after_steps, step_weights, steps
 from biresnerf.forecast.run_forecast import Forecast, Phase
 from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refinement.finish.photo_trial import photos_will_be_asked
-from biresnerf.refinement.optimise.methods import find_method
+from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.two_stages import TwoStages
 from biresnerf.refinement.start.first_step import adjusts_cameras
@@ -19,11 +19,12 @@ from biresnerf.refinement.start.first_step import adjusts_cameras
 PHOTOS_LOOKED_AT, SMALL = 3, 64  # to see whether there is a background, and px
 
 
-def expect_run(forecast: Forecast, dataset: Dataset, options: ResolvedOptions) -> None:
+def expect_run(forecast: Forecast, dataset: Dataset, recipe: Recipe) -> None:
     """All of a run, as far as it is known before its features are."""
+    options = recipe.options
     few = replace(dataset, frames=dataset.frames[:PHOTOS_LOOKED_AT])
     unbounded = load_images(few, SMALL, options.background).background is None
-    adjusts = adjusts_cameras(as_views(dataset), find_method(options.method))
+    adjusts = adjusts_cameras(as_views(dataset), recipe.method)
     work = workload(dataset, options, unbounded=unbounded, adjusts=adjusts)
     forecast.step_weights, forecast.share = dict(work.step_weights), work.share
     forecast.left |= work.amounts

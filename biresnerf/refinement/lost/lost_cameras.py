@@ -74,7 +74,7 @@ class LostCameraRepair:
     def due(self) -> bool:
         """Whether one of the fixed points has been reached. The switch runs a repair without asking."""
         optimiser, options = self.optimiser, self.optimiser.options
-        if not optimiser.method.robust_extensions:
+        if not optimiser.method.repair:
             return False
         if optimiser.switch is None:
             least = float(options.coarse_steps_min)
@@ -87,7 +87,7 @@ class LostCameraRepair:
     def run(self, *, switching: bool = False) -> None:
         """Try to repair all lost cameras, the worst first, as far as the budget goes."""
         optimiser = self.optimiser
-        if not optimiser.method.robust_extensions:
+        if not optimiser.method.repair:
             return
         self._times = 3 if switching else self._times + 1 if optimiser.switch is None else 4
         total = float(optimiser.schedule.samples(optimiser.schedule.steps, 0)) * optimiser.schedule.steps

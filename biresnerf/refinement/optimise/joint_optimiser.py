@@ -16,12 +16,11 @@ from biresnerf.field.radiance_field import Marching, PositionGradient, Rays, Ren
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.perturb import RIG_DISTANCE
 from biresnerf.geometry.rigid_bodies import RigidBodies
-from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refinement.optimise.async_metrics import AsyncMetrics, StepResult
 from biresnerf.refinement.optimise.camera_errors import CameraErrors
 from biresnerf.refinement.optimise.cast_rays import turned, viewing_directions
 from biresnerf.refinement.optimise.joint_step import joint_step, step_numbers
-from biresnerf.refinement.optimise.methods import find_method
+from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.optimise.optimiser_state import Part, StepState, load_state_of, state_of
 from biresnerf.refinement.optimise.photo_sampler import PhotoSampler
 from biresnerf.refinement.optimise.pose_hypotheses import photo_distances
@@ -55,18 +54,17 @@ class JointOptimiser:
         images: ImageSet,
         frame: SceneFrame,
         unit_from_cam: np.ndarray,
-        options: ResolvedOptions,
+        recipe: Recipe,
         held_out: list[int],
-        device: torch.device,
-        threads: int,
         mobility: np.ndarray | None = None,
         bodies: RigidBodies | None = None,
         lenses: IntrinsicsParameters | None = None,
         sampler: PhotoSampler | None = None,
     ) -> None:
+        options, device, threads = recipe.options, recipe.device, recipe.threads
         self.frame, self.options, self.device, self.threads = frame, options, device, threads
         self.bodies = bodies or RigidBodies.free(len(images))
-        self.method = find_method(options.method)
+        self.method = recipe.method
         self.field = self.method.build_field(options, frame, device, threads)
         self.lenses = lenses or IntrinsicsParameters.held(images.cameras, device)
         self.poses = self._pose_parameters(torch.from_numpy(unit_from_cam))
@@ -92,12 +90,17 @@ class JointOptimiser:
         self.batch_share = 1.0  # of the samples asked for; less where they do not fit in memory
         self.mobility = (
             torch.ones(2, len(self.poses), device=device)
-            if mobility is None or not self.method.robust_extensions
+            if mobility is None or not self.method.mobility
             else torch.tensor(mobility, dtype=torch.float32, device=device)
         )
         self.mobility[:, torch.from_numpy(self.bodies.fixed).to(device)] = 0.0
         guess = self.schedule.samples(0, None) // (self.field.stratified or FIRST_SAMPLES)
         self.rays = max(self.method.rays_least, guess)
+
+    @property
+    def recipe(self) -> Recipe:
+        """That of the rest of the run, whose options may have changed on its way."""
+        return Recipe(self.options, self.method, self.device, self.threads)
 
     @cached_property
     def photo_distances(self) -> NDArray[np.float32]:
@@ -128,7 +131,7 @@ class JointOptimiser:
 
     def marching(self, interval: float) -> Marching:
         near, far = self.schedule.near(self.step_index, self.switch), self.schedule.far(self.frame.far)
-        near = self.frame.distance * (max(near, self.frame.near) if self.method.robust_extensions else near)
+        near = self.frame.distance * (max(near, self.frame.near) if self.method.near_plane else near)
         merging = self.method.merging if self.switch is not None else None  # stage 1 needs every sample
         return Marching(interval, near, far, MOST_SAMPLES, self.occupancy.occupied, merging)
 

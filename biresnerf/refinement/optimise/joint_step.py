@@ -96,6 +96,6 @@ def joint_step(optimiser: JointOptimiser, told: StepNumbers) -> StepOutcome:
 
 def _loss(optimiser: JointOptimiser, colour: Tensor, batch: PixelBatch) -> Tensor:
     weight, of_camera = batch.weight, optimiser.camera_errors.weights
-    if of_camera is not None and optimiser.method.robust_extensions:
+    if of_camera is not None and optimiser.method.weights:
         weight = weight * of_camera[batch.image]
     return (optimiser.method.loss(colour, batch.target) * weight[:, None]).mean()

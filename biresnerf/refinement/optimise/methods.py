@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -38,8 +38,14 @@ class Method:
         occupancy_side: cells a side of the occupancy grid, given the options.
         two_stages: whether there is a switch; a run without one is in its last stage from the first step.
         pose_betas: of the poses' Adam.
-        robust_extensions: ours around the switch: cameras must be still, cameras placed by matches move less, and
-            stage 1 is shorter for them; lost cameras weigh less and are repaired.
+        guard: stage 2 begins only when cameras are still.
+        mobility: cameras placed by matches keep still in stage 1.
+        short_stage_1: stage 1 is shorter where matches placed most cameras.
+        near_plane: nothing is sampled nearer than where other cameras look too.
+        weights: lost cameras weigh less in the loss.
+        repair: lost cameras are given other poses.
+        adjustment: all cameras are adjusted at once, and perspective lenses with them.
+        uncertainty: the report says how far each pose may be off.
         robust_frame: results return to the input's frame by a similarity robust to lost cameras, or by the least
             squares of camera centres alone.
         large_network: the field is one large network, whose samples cost tens of times those of a grid.
@@ -55,7 +61,14 @@ class Method:
     occupancy_side: Callable[[ResolvedOptions], int]
     two_stages: bool = False
     pose_betas: tuple[float, float] = (0.9, 0.999)
-    robust_extensions: bool = False
+    guard: bool = False
+    mobility: bool = False
+    short_stage_1: bool = False
+    near_plane: bool = False
+    weights: bool = False
+    repair: bool = False
+    adjustment: bool = False
+    uncertainty: bool = False
     robust_frame: bool = False
     large_network: bool = False
     pruned: bool = True
@@ -82,7 +95,7 @@ def two_grids(
         options.pose_levels, options.pose_resolution_min, options.pose_resolution_max, DENSE_TABLE_LOG2
     )
     shape = FieldShape(dense, reconstruction_levels(options), frame.unbounded)
-    return make_field(shape, options.seed, device, threads)
+    return make_field(shape, options, device, threads)
 
 
 def reconstruction_levels(options: ResolvedOptions) -> GridLevels:
@@ -107,7 +120,14 @@ BIRESNERF = Method(
     _affordable_occupancy,
     two_stages=True,
     pose_betas=(0.9, 0.99),
-    robust_extensions=True,
+    guard=True,
+    mobility=True,
+    short_stage_1=True,
+    near_plane=True,
+    weights=True,
+    repair=True,
+    adjustment=True,
+    uncertainty=True,
     robust_frame=True,
     merging=Merging(light=0.03, most=8),
     by_detail=0.5,
@@ -123,3 +143,24 @@ def find_method(name: MethodName) -> Method:
     if name == "biresnerf":
         return BIRESNERF
     return getattr(importlib.import_module(BASELINES), name.upper().replace("-", "_"))
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How a field and poses are trained: the options, the method, and where it is computed."""
+
+    options: ResolvedOptions
+    method: Method
+    device: torch.device
+    threads: int
+
+    @classmethod
+    def of(
+        cls, options: ResolvedOptions, device: torch.device, threads: int, method: Method | None = None
+    ) -> Recipe:
+        """With the method that the options name, if none is given."""
+        return cls(options, method or find_method(options.method), device, threads)
+
+    def changed(self, **options: int) -> Recipe:
+        """With other values of some options."""
+        return replace(self, options=self.options.model_copy(update=options))

@@ -73,7 +73,7 @@ class TwoStages:
         self.ends = math.inf
         self.record, self.history = RunRecord(), History(folder)
         self.repair = LostCameraRepair(optimiser, OwnMatches.of(scene))
-        self.detector = StabilityDetector(0, 0, guarded=optimiser.method.robust_extensions)
+        self.detector = StabilityDetector(0, 0, guarded=optimiser.method.guard)
         self._take_lengths()
         self._previews = PreviewTimer(optimiser.options.checkpoint_every_s)
         self._reported = self._saved = 0.0

@@ -11,15 +11,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.data.workload import LOOKS, TRIAL_STEPS
-from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.progress import Monitor, Progress
+from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.start.forward_facing import find_forward_facing
 from biresnerf.refinement.start.matches_explained import matches_explained
 from biresnerf.refinement.start.turntable import start_on_turntable
@@ -43,9 +42,7 @@ def find_start(
     dataset: Dataset,
     images: ImageSet,
     tracks: Tracks | None,
-    options: ResolvedOptions,
-    device: torch.device,
-    threads: int,
+    recipe: Recipe,
     monitor: Monitor,
 ) -> InitialPoses:
     """The candidate that predicts unseen photos best; poses found without features where the set has no others.
@@ -59,10 +56,8 @@ def find_start(
         message = "looking for poses without features"
         monitor.report(Progress(stage="seeding", message=message))
         if first.source == "turntable":
-            return start_on_turntable(first, images, options, device, threads, monitor.should_stop)
-        found = find_forward_facing(
-            first.world_from_cam, images, options, device, threads, monitor.should_stop
-        )
+            return start_on_turntable(first, images, recipe, monitor.should_stop)
+        found = find_forward_facing(first.world_from_cam, images, recipe, monitor.should_stop)
         return replace(first, world_from_cam=found)
     if len(candidates) == 1:
         return replace(first, matched_poses=first.world_from_cam if first.matched.any() else None)
@@ -73,25 +68,14 @@ def find_start(
         for candidate in candidates
     ]
     with monitor.forecast.within("trying"):
-        return choose_start(
-            candidates,
-            images,
-            explained,
-            options,
-            device,
-            threads,
-            monitor.should_stop,
-            monitor.forecast.took,
-        )
+        return choose_start(candidates, images, explained, recipe, monitor.should_stop, monitor.forecast.took)
 
 
 def choose_start(
     candidates: Sequence[InitialPoses],
     images: ImageSet,
     explained: Sequence[float],
-    options: ResolvedOptions,
-    device: torch.device,
-    threads: int,
+    recipe: Recipe,
     should_stop: Callable[[], bool],
     did: Callable[[float], None] = lambda _work: None,
 ) -> InitialPoses:
@@ -114,7 +98,7 @@ def choose_start(
     unseen = trial_views(len(images))
 
     def begun(steps: int, *, moving: bool) -> list[Trial]:
-        trials = PoseTrials(images, unseen, rigs, options, steps, device, threads, should_stop)
+        trials = PoseTrials(images, unseen, rigs, recipe, steps, should_stop)
         return [trials.begin(rig, moving=moving) for rig in rigs]
 
     work = 0.0

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.data.workload import can_be_adjusted
 from biresnerf.options.presets import FEWEST_OF_STAGE
-from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
+from biresnerf.options.refine_options import RefineOptions
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
-from biresnerf.refinement.optimise.methods import Method, find_method
+from biresnerf.refinement.optimise.methods import Method, Recipe
 from biresnerf.refinement.parameters.intrinsics_parameters import lenses_of
 from biresnerf.refinement.parameters.rigid_bodies import rigid_bodies
 from biresnerf.refinement.scene.scene import Scene
@@ -23,21 +22,19 @@ from biresnerf.refinement.scene.scene_frame import scene_frame
 MATCHED_COARSE_SHARE = 2 / 3
 
 
-def first_step(scene: Scene, options: ResolvedOptions, device: torch.device, threads: int) -> JointOptimiser:
+def first_step(scene: Scene, recipe: Recipe) -> JointOptimiser:
     """The optimisation at its first step, in the unit frame of the initial poses."""
-    dataset, images, start = scene.dataset, scene.images, scene.start
+    dataset, images, start, options = scene.dataset, scene.images, scene.start, recipe.options
     bodies = rigid_bodies(dataset, options)
     world_from_cam = bodies.held(start.world_from_cam, dataset.world_from_cam)
     frame = scene_frame(world_from_cam, images, matched_depth(dataset, world_from_cam, scene.tracks))
     poses = frame.unit_from_world.apply_to_poses(world_from_cam)
     excluded = scene.excluded_from_training
-    adjusted = scene.tracks is not None and adjusts_cameras(dataset, find_method(options.method))
+    adjusted = scene.tracks is not None and adjusts_cameras(dataset, recipe.method)
     fisheye = any(camera.full().fisheye for camera in dataset.cameras)
     by_photos = "none" if adjusted and not fisheye else options.refine_intrinsics
-    lenses = lenses_of(dataset, images, by_photos, excluded, device, dollies=not bodies.tied)
-    optimiser = JointOptimiser(
-        images, frame, poses, options, excluded, device, threads, pose_mobility(start), bodies, lenses
-    )
+    lenses = lenses_of(dataset, images, by_photos, excluded, recipe.device, dollies=not bodies.tied)
+    optimiser = JointOptimiser(images, frame, poses, recipe, excluded, pose_mobility(start), bodies, lenses)
     optimiser.camera_errors.doubt(start.guessed)
     return optimiser
 
@@ -47,7 +44,7 @@ def adjusts_cameras(dataset: Dataset, method: Method) -> bool:
 
     Not by methods of others.
     """
-    return method.robust_extensions and can_be_adjusted(len(dataset))
+    return method.adjustment and can_be_adjusted(len(dataset))
 
 
 def pose_mobility(start: InitialPoses) -> NDArray[np.float64]:
@@ -58,10 +55,11 @@ def pose_mobility(start: InitialPoses) -> NDArray[np.float64]:
     return np.stack([np.where(start.matched, 0.0, 1.0), np.ones(len(start.matched))])
 
 
-def stage_lengths(start: InitialPoses, asked: RefineOptions, resolved: ResolvedOptions) -> ResolvedOptions:
-    """`resolved` with a shorter stage 1 where matches placed most cameras, unless its length was `asked` for."""
-    if not (start.mostly_matched and find_method(resolved.method).robust_extensions):
-        return resolved
+def stage_lengths(start: InitialPoses, asked: RefineOptions, recipe: Recipe) -> Recipe:
+    """The recipe with a shorter stage 1 where matches placed most cameras, unless its length was `asked` for."""
+    if not (start.mostly_matched and recipe.method.short_stage_1):
+        return recipe
+    resolved = recipe.options
     names = [n for n in ("coarse_steps_min", "coarse_steps_max") if getattr(asked, n) is None]
     shorter = {
         name: max(FEWEST_OF_STAGE, round(MATCHED_COARSE_SHARE * getattr(resolved, name))) for name in names
@@ -69,4 +67,4 @@ def stage_lengths(start: InitialPoses, asked: RefineOptions, resolved: ResolvedO
     if "coarse_steps_max" in shorter:
         least = shorter.get("coarse_steps_min", resolved.coarse_steps_min)
         shorter["coarse_steps_max"] = max(least, shorter["coarse_steps_max"])
-    return resolved.model_copy(update=shorter)
+    return recipe.changed(**shorter)

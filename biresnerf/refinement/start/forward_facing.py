@@ -13,13 +13,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.errors import InputError, Interrupted
-from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.scene.scene_frame import SceneFrame, scene_frame
 from biresnerf.refinement.views.evaluation import score_views
 from biresnerf.refinement.views.pose_trials import trial_views
@@ -46,9 +45,7 @@ class Found:
 def find_forward_facing(
     world_from_cam: NDArray[np.float64],
     images: ImageSet,
-    options: ResolvedOptions,
-    device: torch.device,
-    threads: int,
+    recipe: Recipe,
     should_stop: Callable[[], bool],
 ) -> NDArray[np.float64]:
     """Poses [n, 4, 4] of photos taken from nearly one place, in a frame of their own.
@@ -63,7 +60,7 @@ def find_forward_facing(
     frame = scene_frame(np.tile(np.eye(4), (len(images), 1, 1)), images)
 
     def run(world_from_cam: NDArray[np.float64], steps: int) -> Found:
-        return _short_run(images, frame, world_from_cam, options, steps, device, threads, should_stop)
+        return _short_run(images, frame, world_from_cam, recipe, steps, should_stop)
 
     first = run(world_from_cam, FIRST_STEPS)
     tries = [run(rig, SECOND_STEPS) for rig in (first.world_from_cam, mirrored(first.world_from_cam))]
@@ -126,24 +123,20 @@ def _short_run(
     images: ImageSet,
     frame: SceneFrame,
     world_from_cam: NDArray[np.float64],
-    options: ResolvedOptions,
+    recipe: Recipe,
     steps: int,
-    device: torch.device,
-    threads: int,
     should_stop: Callable[[], bool],
 ) -> Found:
     """Stage 1 alone, from these poses; the views that score it move their own pose, but do not train the field."""
     unseen = trial_views(len(images))
-    short = options.model_copy(
-        update={
-            "steps": steps,
-            "coarse_steps_min": steps // 4,
-            "coarse_steps_max": steps,
-            "samples_per_step": min(SAMPLES, options.samples_per_step),
-        }
+    short = recipe.changed(
+        steps=steps,
+        coarse_steps_min=steps // 4,
+        coarse_steps_max=steps,
+        samples_per_step=min(SAMPLES, recipe.options.samples_per_step),
     )
     poses = frame.unit_from_world.apply_to_poses(world_from_cam)
-    optimiser = JointOptimiser(images, frame, poses, short, unseen, device, threads)
+    optimiser = JointOptimiser(images, frame, poses, short, unseen)
     for _ in range(steps):
         if should_stop():
             raise Interrupted("stopped while poses were looked for without features")

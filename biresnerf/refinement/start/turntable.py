@@ -25,9 +25,8 @@ from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.errors import InputError, Interrupted
 from biresnerf.geometry.level_ring import order_on_ring
 from biresnerf.geometry.turntable import Ring
-from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
-from biresnerf.refinement.optimise.methods import find_method
+from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.optimise.photo_sampler import PhotoSampler
 from biresnerf.refinement.parameters.ring_parameters import RingParameters
 from biresnerf.refinement.scene.scene_frame import scene_frame
@@ -63,15 +62,13 @@ class RingTrials:
         self,
         images: ImageSet,
         order: RingOrder,
-        options: ResolvedOptions,
-        device: torch.device,
-        threads: int,
+        recipe: Recipe,
         should_stop: Callable[[], bool],
     ) -> None:
         self._run = torch.from_numpy(order.run)
         self.images, self.unseen = images, trial_views(len(images))
-        self._options, self._device, self._threads, self._should_stop = options, device, threads, should_stop
-        self._sampler = PhotoSampler(images, self.unseen, device, find_method(options.method).by_detail)
+        self._recipe, self._should_stop = recipe, should_stop
+        self._sampler = PhotoSampler(images, self.unseen, recipe.device, recipe.method.by_detail)
         pixels = int(sum(images.widths[v] * images.heights[v] for v in self.unseen))
         self._stride = max(1, math.ceil(math.sqrt(pixels / UNSEEN_RAYS)))
         even = torch.arange(len(images)) * (2 * torch.pi / len(images))
@@ -83,26 +80,15 @@ class RingTrials:
         Raises:
             Interrupted: ``should_stop`` returned true.
         """
-        short = self._options.model_copy(
-            update={
-                "steps": TRY_STEPS,
-                "coarse_steps_min": TRY_STEPS // 4,
-                "coarse_steps_max": 2 * TRY_STEPS,
-                "samples_per_step": min(SAMPLES, self._options.samples_per_step),
-            }
+        short = self._recipe.changed(
+            steps=TRY_STEPS,
+            coarse_steps_min=TRY_STEPS // 4,
+            coarse_steps_max=2 * TRY_STEPS,
+            samples_per_step=min(SAMPLES, self._recipe.options.samples_per_step),
         )
         poses = self.frame.unit_from_world.apply_to_poses(ring.matrices())
-        optimiser = JointOptimiser(
-            self.images,
-            self.frame,
-            poses,
-            short,
-            self.unseen,
-            self._device,
-            self._threads,
-            sampler=self._sampler,
-        )
-        moving = RingParameters(ring, self.frame.distance, self._run, self._device)
+        optimiser = JointOptimiser(self.images, self.frame, poses, short, self.unseen, sampler=self._sampler)
+        moving = RingParameters(ring, self.frame.distance, self._run, self._recipe.device)
         optimiser.poses = moving
         for _ in range(TRY_STEPS):
             if self._should_stop():
@@ -115,9 +101,7 @@ class RingTrials:
 def start_on_turntable(
     even: InitialPoses,
     images: ImageSet,
-    options: ResolvedOptions,
-    device: torch.device,
-    threads: int,
+    recipe: Recipe,
     should_stop: Callable[[], bool],
 ) -> InitialPoses:
     """The ring of cameras that predicts unseen photos best, in a frame of its own.
@@ -133,7 +117,7 @@ def start_on_turntable(
     """
     refuse_still_background(images)
     order = find_ring(images, order_on_ring(even.world_from_cam))
-    trials = RingTrials(images, order, options, device, threads, should_stop)
+    trials = RingTrials(images, order, recipe, should_stop)
     ways = []
     for rings in rings_to_try(images, order):
         tried = [trials.run(ring) for ring in rings]

@@ -23,14 +23,14 @@ OPEN = "their matches do not determine them"
 def pose_uncertainty(
     stages: TwoStages, finish: Finish, judgement: Judgement | None
 ) -> tuple[PoseUncertainty, ...]:
-    """Of each image's returned pose; of none where the method is another one's.
+    """Of each image's returned pose; of none where the method tells none.
 
     Args:
         finish: with the poses that fit all evidence that is to be trusted.
         judgement: None where there is no verdict, and the refined poses are returned.
     """
     optimiser, dataset = stages.optimiser, stages.scene.dataset
-    if not optimiser.method.robust_extensions:
+    if not optimiser.method.uncertainty:
         return ()
     refined = RefinedPoses.now(dataset, optimiser)
     poses, input_from_optimised = refined.world_from_cam, refined.input_from_optimised

@@ -18,6 +18,7 @@ from biresnerf.refinement.finish.time_budget import budget_warnings
 from biresnerf.refinement.lost.own_matches import LEAST_PAIRS
 from biresnerf.refinement.optimise.device_memory import smaller_batches
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.optimise.method_changes import method_warnings
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.two_stages import TwoStages
 from biresnerf.refinement.start.choose_start import MARGIN_DB
@@ -87,6 +88,7 @@ def run_report(
         + accuracy_warnings(finish.given, optimiser.options)
         + unmatched_warnings(scene)
         + one_place_warnings(scene.tracks, refined)
+        + method_warnings(optimiser.recipe)
         + gpu_warnings(optimiser.device)
         + smaller_batches(optimiser)
         + budget_warnings(stages)

@@ -7,15 +7,14 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.workload import LOOKS, picture_share
 from biresnerf.geometry.camera.camera_models import Camera
-from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refinement.adjustment.paired import paired
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.views.held_out_views import ROUNDS_MOST, unseen_rounds
 from biresnerf.refinement.views.image_metrics import shift_px
@@ -96,9 +95,7 @@ def compare_on_unseen_views(
     pair: tuple[Rig, Rig],
     images: ImageSet,
     held_out: Sequence[int],
-    options: ResolvedOptions,
-    device: torch.device,
-    threads: int,
+    recipe: Recipe,
     should_stop: Callable[[], bool],
     report: Callable[[float], None] = lambda _share: None,
     effort: Effort = Effort(),
@@ -114,7 +111,7 @@ def compare_on_unseen_views(
     Raises:
         Interrupted: ``should_stop`` returned true.
     """
-    steps = effort.times * options.trial_steps
+    steps = effort.times * recipe.options.trial_steps
     rounds = unseen_rounds(len(images), held_out)[: effort.rounds_most]
     if steps == 0 or not rounds[0]:
         return None
@@ -124,7 +121,7 @@ def compare_on_unseen_views(
     work = 0.0
     renders: BeforeAfter = {}
     for done, views in enumerate(rounds):
-        trials = PoseTrials(images, views, rigs, options, steps, device, threads, should_stop)
+        trials = PoseTrials(images, views, rigs, recipe, steps, should_stop)
         running = [trials.begin(rig.world_from_cam, rig.lenses(images)) for rig in pair]
         seen = seen + views
         pictured = effort.pictured and not done
@@ -218,9 +215,8 @@ def compare_placed(
     images = scene.images if placed.all() else scene.images.of(rows)
     held_out = np.flatnonzero(np.isin(rows, scene.held_out)).tolist()
     found = compare_on_unseen_views(
-        (before.of(rows), after.of(rows)), images, held_out, optimiser.options, optimiser.device, optimiser.threads,
-        should_stop, report, effort,
-    )  # fmt: skip
+        (before.of(rows), after.of(rows)), images, held_out, optimiser.recipe, should_stop, report, effort
+    )
     if found is None:
         return None
     renders = {int(rows[view]): pair for view, pair in found.renders.items()}

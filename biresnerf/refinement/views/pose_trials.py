@@ -20,9 +20,8 @@ from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.workload import OPEN_STEP, OPEN_STEPS
 from biresnerf.errors import Interrupted
 from biresnerf.geometry.camera.camera_models import Camera
-from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
-from biresnerf.refinement.optimise.methods import find_method
+from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.optimise.photo_sampler import PhotoSampler
 from biresnerf.refinement.scene.scene_frame import scene_frame
 from biresnerf.refinement.views.evaluation import render_view
@@ -61,7 +60,7 @@ class PoseTrials:
         images: photos at working size.
         unseen: indices of the views that no field is trained on.
         rigs: sets of poses [n, 4, 4] that together define the scene box; in one frame.
-        options: the field's sizes and rates.
+        recipe: the field's sizes and rates, and how it is trained.
         steps: of each training; an open scene takes `OPEN_STEPS` times as many.
         should_stop: called after every step.
     """
@@ -71,10 +70,8 @@ class PoseTrials:
         images: ImageSet,
         unseen: Sequence[int],
         rigs: Sequence[NDArray[np.float64]],
-        options: ResolvedOptions,
+        recipe: Recipe,
         steps: int,
-        device: torch.device,
-        threads: int,
         should_stop: Callable[[], bool],
         sampler: PhotoSampler | None = None,
     ) -> None:
@@ -83,18 +80,14 @@ class PoseTrials:
         self.steps = steps * (OPEN_STEPS if self.frame.unbounded else 1)
         # All of it stage 1, and the rates fall to their end: with the rates of a longer run's first half, trainings on
         # the same poses differ by 0.25 dB from seed to seed (lego at 100 px, 200 steps), so by 0.04.
-        self._options = options.model_copy(
-            update={
-                "steps": self.steps,
-                "coarse_steps_min": self.steps,
-                "coarse_steps_max": self.steps,
-                "samples_per_step": min(SAMPLES, options.samples_per_step),
-            }
+        self._recipe = recipe.changed(
+            steps=self.steps,
+            coarse_steps_min=self.steps,
+            coarse_steps_max=self.steps,
+            samples_per_step=min(SAMPLES, recipe.options.samples_per_step),
         )
-        self._device, self._threads, self._should_stop = device, threads, should_stop
-        self._sampler = sampler or PhotoSampler(
-            images, self.unseen, device, find_method(options.method).by_detail
-        )
+        self._should_stop = should_stop
+        self._sampler = sampler or PhotoSampler(images, self.unseen, recipe.device, recipe.method.by_detail)
 
     def score(
         self,
@@ -128,9 +121,8 @@ class PoseTrials:
         images = self.images if cameras is None else replace(self.images, cameras=cameras)
         poses = self.frame.unit_from_world.apply_to_poses(world_from_cam)
         optimiser = JointOptimiser(
-            images, self.frame, poses, self._options, self.unseen, self._device, self._threads,
-            sampler=self._sampler,
-        )  # fmt: skip
+            images, self.frame, poses, self._recipe, self.unseen, sampler=self._sampler
+        )
         optimiser.poses_held = not moving
         return Trial(optimiser, images, self.unseen, self.steps, self._should_stop)
 

@@ -120,7 +120,7 @@ def one_grid(
     """One hashed grid whose levels open from coarse to fine."""
     levels = reconstruction_levels(options)
     shape = FieldShape(levels, grid_levels(0, 1, 1, 0), frame.unbounded, broadcast=True)
-    return make_field(shape, options.seed, device, threads)
+    return make_field(shape, options, device, threads)
 
 
 def barf_network(samples_per_ray: int | None) -> BuildField:

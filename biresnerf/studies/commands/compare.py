@@ -56,7 +56,8 @@ def comparison_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option("--methods", metavar="A,B", help="Variants that differ in the option `method`."),
         click.option(
             "--variant", "variants", multiple=True, metavar="'NAME: KEY=VALUE ...'",
-            help="A variant of the options, by name; may be repeated. The first one is what others are tested against.",
+            help="A variant of the options, by name; may be repeated. The first one is what others are tested against. "
+            "method.FIELD=VALUE changes a field of the method, as method.repair=false.",
         ),
         click.option("--noise", callback=_numbers(float), metavar="A,B", help="BARF's sigma. Default: 0.15."),
         click.option(

@@ -17,6 +17,7 @@ from biresnerf.field.reference.field import ReferenceField
 from biresnerf.geometry.camera.camera import directions_in_cam
 from biresnerf.refinement.verdict import run_report
 from tests.field.cuda.fields import DEVICE, HAS_GPU, SHAPES
+from tests.refinement.tiny_scene import tiny_options
 
 pytestmark = pytest.mark.slow
 
@@ -101,7 +102,7 @@ def test_plain_torch_takes_the_place_of_kernels_that_fail(monkeypatch, caplog):
     monkeypatch.setattr(backends, "gpu_faults", lambda _device: ("colour differs by 30%",))
     monkeypatch.setattr(run_report, "gpu_faults", lambda _device: ("colour differs by 30%",))
     # Stands for a GPU: neither needs one to be made.
-    field = backends.make_field(SHAPES[False], 3, torch.device("meta"), 1)
+    field = backends.make_field(SHAPES[False], tiny_options(), torch.device("meta"), 1)
     assert field.backend == "reference"
     assert "colour differs by 30%" in caplog.text
     assert backends.directions_for(torch.device("cuda")) is directions_in_cam

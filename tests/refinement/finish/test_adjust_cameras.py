@@ -138,7 +138,7 @@ def test_guessed_cameras_that_match_each_other_have_no_say(tmp_path, rng):
 
 def test_methods_of_others_are_left_alone(tmp_path, rng):
     run, _ = stages(tmp_path, rng)
-    run.optimiser.method = replace(run.optimiser.method, robust_extensions=False)
+    run.optimiser.method = replace(run.optimiser.method, adjustment=False)
     assert adjust_cameras(run).candidates == ()
 
 

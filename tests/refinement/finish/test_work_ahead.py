@@ -12,7 +12,7 @@ from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.similarity import Similarity
 from biresnerf.refinement.finish.work_ahead import expect_as_measured, expect_rest, expect_run, work_ahead
 from biresnerf.refinement.stages.two_stages import TwoStages
-from tests.refinement.tiny_scene import given_scene, tiny_optimiser, tiny_options, tiny_set
+from tests.refinement.tiny_scene import given_scene, tiny_optimiser, tiny_options, tiny_recipe, tiny_set
 
 TRACKS = Tracks.of(np.array([0, 0]), np.array([0, 1]), np.ones((2, 2)))
 
@@ -81,15 +81,15 @@ def test_methods_of_others_do_not_adjust(stages_of):
 
 
 def test_a_run_from_given_poses_is_known_before_its_first_step(scene, stages_of):
-    found, options = Forecast(), tiny_options(start="given")
-    expect_run(found, scene[0], options)
+    found = Forecast()
+    expect_run(found, scene[0], tiny_recipe(start="given"))
     assert found.left == pytest.approx(stages_of(start="given").forecast.left)
 
 
 def test_matching_is_expected_where_poses_are_compared_with_matches(scene):
     pytest.importorskip("pycolmap")
     found = Forecast()
-    expect_run(found, scene[0], tiny_options(start="auto"))
+    expect_run(found, scene[0], tiny_recipe(start="auto"))
     assert all(found.left[phase] > 0 for phase in ("features", "matching", "mapping", "trying"))
     assert found.left["checking"] == 0, "matches mostly start the run"
 

@@ -18,6 +18,7 @@ from biresnerf.progress import Monitor
 from biresnerf.refinement.finish.outcome import Finish
 from biresnerf.refinement.lost import lost_cameras
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.parameters.pose_parameters import PoseParameters
 from biresnerf.refinement.scene.scene_frame import scene_frame
 from biresnerf.refinement.stages.checkpoint import load_checkpoint
@@ -59,7 +60,7 @@ def start(
         max_image_size=SIZE,
     )
     optimiser = JointOptimiser(
-        scene[1], scene_frame(scene[0].world_from_cam, scene[1]), poses, options, HELD_OUT, CPU, threads=1
+        scene[1], scene_frame(scene[0].world_from_cam, scene[1]), poses, Recipe.of(options, CPU, 1), HELD_OUT
     )
     return TwoStages(
         optimiser,

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.scene.scene_frame import scene_frame
 from tests.refinement.tiny_scene import tiny_options, tiny_set
 
@@ -18,7 +19,7 @@ def test_a_step_waits_for_nothing_and_the_error_falls(tmp_path):
     frame = scene_frame(dataset.world_from_cam, images)
     start = frame.unit_from_world.apply_to_poses(dataset.world_from_cam)
     options = tiny_options(device="cuda", steps=400, coarse_steps_max=200)
-    optimiser = JointOptimiser(images, frame, start, options, [1], torch.device("cuda"), threads=1)
+    optimiser = JointOptimiser(images, frame, start, Recipe.of(options, torch.device("cuda"), 1), [1])
     first = [optimiser.step().mean_squared_error for _ in range(18)]
     rays = optimiser.rays  # steps of other numbers of rays have graphs of their own, to be recorded first
     for _ in range(4):

@@ -9,6 +9,7 @@ import torch
 from benchmarks.gpu.launches import traced_step
 from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.parameters.intrinsics_parameters import lenses_of
 from biresnerf.refinement.scene.scene_frame import scene_frame
 from tests.refinement.tiny_scene import CPU, tiny_options, tiny_set
@@ -29,7 +30,9 @@ def trained(tiny, *, stage: int = 1, bodies: RigidBodies | None = None, **option
     start = frame.unit_from_world.apply_to_poses(dataset.world_from_cam)
     chosen = tiny_options(**options)
     lenses = lenses_of(dataset, images, chosen.refine_intrinsics, HELD_OUT, CPU)
-    made = JointOptimiser(images, frame, start, chosen, HELD_OUT, CPU, 2, bodies=bodies, lenses=lenses)
+    made = JointOptimiser(
+        images, frame, start, Recipe.of(chosen, CPU, 2), HELD_OUT, bodies=bodies, lenses=lenses
+    )
     if stage == 2:
         made.start_reconstruction()
     for _ in range(3):

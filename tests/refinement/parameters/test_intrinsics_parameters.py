@@ -16,6 +16,7 @@ from biresnerf.data.synthetic.scene import render_synthetic, synthetic_cameras, 
 from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam
 from biresnerf.geometry.camera.camera_models import FAMILY_MODELS, MODEL_PARAMETERS, Camera
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.parameters.intrinsics_parameters import (
     COLUMNS,
     FOCAL,
@@ -254,7 +255,7 @@ def with_lenses(scene, options, factor: float, part: str, *, dollies: bool = Tru
     lenses = IntrinsicsParameters([wrong], [0] * len(poses), [part], images.cameras, [], CPU, dollies=dollies)
     frame = scene_frame(poses, images)
     start = frame.unit_from_world.apply_to_poses(poses)
-    return JointOptimiser(images, frame, start, options, [], CPU, 2, lenses=lenses)
+    return JointOptimiser(images, frame, start, Recipe.of(options, CPU, 2), [], lenses=lenses)
 
 
 def test_a_focal_length_5_percent_off_comes_back_towards_the_truth(scene):

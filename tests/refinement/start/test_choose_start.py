@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,13 +15,14 @@ from biresnerf.errors import Interrupted
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.progress import Monitor
+from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.start import choose_start as start_module
 from biresnerf.refinement.start.choose_start import choose_start, find_start
 from biresnerf.refinement.start.first_step import pose_mobility, stage_lengths
 from biresnerf.refinement.start.matches_explained import explained_from_one_place, matches_explained
 from biresnerf.refinement.views import pose_trials
 from biresnerf.refinement.views.pose_trials import PoseTrials, trial_views
-from tests.refinement.tiny_scene import CPU, tiny_options, tiny_set, true_matches
+from tests.refinement.tiny_scene import CPU, tiny_recipe, tiny_set, true_matches
 
 pytestmark = pytest.mark.slow
 
@@ -47,7 +49,7 @@ def candidates(dataset, first: np.ndarray, second: np.ndarray) -> list[InitialPo
 
 
 def choose(images, tried: list[InitialPoses]) -> InitialPoses:
-    return choose_start(tried, images, [0.0] * len(tried), tiny_options(), CPU, 2, lambda: False)
+    return choose_start(tried, images, [0.0] * len(tried), tiny_recipe(), lambda: False)
 
 
 def test_good_matches_win_over_noisy_given_poses(scene):
@@ -66,7 +68,7 @@ def test_trials_end_once_one_is_clearly_better(scene, monkeypatch):
     truth, works = dataset.world_from_cam, []
     for other in (perturb_poses(truth, 0.3, seed=1), truth):
         tried = candidates(dataset, other, truth)
-        choose_start(tried, images, [0.0, 0.0], tiny_options(), CPU, 2, lambda: False, works.append)
+        choose_start(tried, images, [0.0, 0.0], tiny_recipe(), lambda: False, works.append)
     assert works == [2 * 240 / 4, 2 * (240 + 150)]
 
 
@@ -81,9 +83,7 @@ def test_trials_end_once_photos_prefer_poses_that_alone_explain_the_matches(scen
     def chosen(first: np.ndarray, second: np.ndarray) -> str:
         tried = candidates(dataset, first, second)
         explained = [matches_explained(dataset, tracks, c.world_from_cam) for c in tried]
-        return choose_start(
-            tried, images, explained, tiny_options(), CPU, 2, lambda: False, works.append
-        ).source
+        return choose_start(tried, images, explained, tiny_recipe(), lambda: False, works.append).source
 
     assert chosen(noisy, truth) == "matches-incremental"
     assert chosen(truth, noisy) == "given"
@@ -123,7 +123,7 @@ def test_good_given_poses_win_over_wrong_matches(scene):
 def test_without_matches_no_matched_poses_are_remembered(scene):
     dataset, images = scene
     given = InitialPoses(dataset.world_from_cam, "given", ("given",) * VIEWS)
-    found = find_start([given], dataset, images, None, tiny_options(), CPU, 2, Monitor())
+    found = find_start([given], dataset, images, None, tiny_recipe(), Monitor())
     assert found.matched_poses is None
     kept = TypeAdapter(InitialPoses).validate_json(TypeAdapter(InitialPoses).dump_json(found))
     assert kept.matched_poses is None
@@ -162,7 +162,7 @@ def test_cameras_that_all_candidates_guess_have_no_say(scene):
 def test_poses_that_may_move_in_a_trial_improve(scene):
     dataset, images = scene
     noisy = perturb_poses(dataset.world_from_cam, 0.05, seed=1)
-    trials = PoseTrials(images, trial_views(VIEWS), [noisy], tiny_options(), 150, CPU, 2, lambda: False)
+    trials = PoseTrials(images, trial_views(VIEWS), [noisy], tiny_recipe(), 150, lambda: False)
     assert trials.score(noisy, moving=True).psnr.mean() > trials.score(noisy).psnr.mean() + 0.5
 
 
@@ -182,12 +182,15 @@ def test_stage_1_is_shorter_where_matches_placed_the_cameras_and_its_length_was_
     dataset, _ = scene
     given, matched = candidates(dataset, dataset.world_from_cam, dataset.world_from_cam)
     open_options = RefineOptions(preset="fast")
-    resolved = open_options.resolved("cpu")
-    assert stage_lengths(given, open_options, resolved) == resolved
-    shorter = stage_lengths(matched, open_options, resolved)
+    recipe = Recipe.of(open_options.resolved("cpu"), CPU, 2)
+    assert stage_lengths(given, open_options, recipe) == recipe
+    shorter = stage_lengths(matched, open_options, recipe).options
     assert (shorter.coarse_steps_min, shorter.coarse_steps_max) == (400, 800)
     fixed = RefineOptions(preset="fast", coarse_steps_min=500, coarse_steps_max=900)
-    assert stage_lengths(matched, fixed, fixed.resolved("cpu")) == fixed.resolved("cpu")
+    long = Recipe.of(fixed.resolved("cpu"), CPU, 2)
+    assert stage_lengths(matched, fixed, long) == long
+    whole = replace(recipe, method=replace(recipe.method, short_stage_1=False))
+    assert stage_lengths(matched, open_options, whole) == whole
 
 
 def test_photos_from_one_place_are_told_from_others_by_their_matches(scene):
@@ -214,7 +217,7 @@ def test_a_run_of_few_steps_keeps_to_the_bounds_that_its_report_is_read_by(scene
     dataset, _ = scene
     _, matched = candidates(dataset, dataset.world_from_cam, dataset.world_from_cam)
     options = RefineOptions(preset="fast", steps=steps, **asked)
-    shorter = stage_lengths(matched, options, options.resolved("cpu"))
+    shorter = stage_lengths(matched, options, Recipe.of(options.resolved("cpu"), CPU, 2)).options
     assert ResolvedOptions.model_validate(shorter.model_dump()) == shorter
 
 
@@ -238,7 +241,7 @@ def test_a_stop_ends_the_trial(scene):
     dataset, images = scene
     tried = candidates(dataset, dataset.world_from_cam, dataset.world_from_cam)
     with pytest.raises(Interrupted):
-        choose_start(tried, images, [0.0, 0.0], tiny_options(), CPU, 2, lambda: True)
+        choose_start(tried, images, [0.0, 0.0], tiny_recipe(), lambda: True)
 
 
 def test_a_start_survives_its_checkpoint(scene):

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from biresnerf.errors import InputError, Interrupted
 from biresnerf.refinement.start import forward_facing
 from biresnerf.refinement.start.forward_facing import find_forward_facing, mirrored, resemblance_psnr
-from tests.refinement.tiny_scene import CPU, photos_set, tiny_options, tiny_set
+from tests.refinement.tiny_scene import photos_set, tiny_recipe, tiny_set
 
 pytestmark = pytest.mark.slow
 
@@ -75,8 +75,8 @@ def test_cameras_around_a_scene_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(forward_facing, "SECOND_STEPS", 30)
     images = tiny_set(tmp_path, views=8, size=24)[1]
     with pytest.raises(InputError) as caught:
-        find_forward_facing(np.tile(np.eye(4), (8, 1, 1)), images, tiny_options(), CPU, 1, lambda: False)
+        find_forward_facing(np.tile(np.eye(4), (8, 1, 1)), images, tiny_recipe(), lambda: False)
     assert caught.value.code == "insufficient_overlap"
     assert caught.value.hint
     with pytest.raises(Interrupted):
-        find_forward_facing(np.tile(np.eye(4), (8, 1, 1)), images, tiny_options(), CPU, 1, lambda: True)
+        find_forward_facing(np.tile(np.eye(4), (8, 1, 1)), images, tiny_recipe(), lambda: True)

@@ -23,7 +23,7 @@ from biresnerf.geometry.turntable import Ring
 from biresnerf.refinement.start import turntable
 from biresnerf.refinement.start.ring_order import find_ring
 from biresnerf.refinement.start.turntable import Tried, at_elevation, likeliest_elevation, start_on_turntable
-from tests.refinement.tiny_scene import CPU, photos_set, tiny_options
+from tests.refinement.tiny_scene import photos_set, tiny_recipe
 
 VIEWS, SIZE = 24, 32
 
@@ -44,7 +44,7 @@ def turned_set(folder: Path, *, backwards: bool) -> tuple[InitialPoses, ImageSet
 def test_a_turning_scene_is_told_from_its_mirror_image_and_its_poses_approached(tmp_path, monkeypatch):
     monkeypatch.setattr(turntable, "ELEVATIONS_DEG", (0.0, 30.0, 60.0))
     even, images, true = turned_set(tmp_path / "set", backwards=True)
-    found = start_on_turntable(even, images, tiny_options(), CPU, 1, lambda: False)
+    found = start_on_turntable(even, images, tiny_recipe(), lambda: False)
 
     def error_deg(poses: np.ndarray) -> float:
         aligned = align_by_spread(poses, true).apply_to_poses(poses)
@@ -68,13 +68,13 @@ def test_a_background_that_stands_still_is_refused_and_said_to_be_in_the_way():
     images = photos_set(photos)
     even = InitialPoses(turntable_cameras(12, 0.0, 0), "turntable", ("turntable",) * 12)
     with pytest.raises(InputError) as caught:
-        start_on_turntable(even, images, tiny_options(), CPU, 1, lambda: False)
+        start_on_turntable(even, images, tiny_recipe(), lambda: False)
     assert caught.value.code == "insufficient_overlap"
     assert "background" in caught.value.detail
     assert "mask" in (caught.value.hint or "")
     masked = replace(images, counts=np.ones(len(images.pixels), dtype=np.bool_))
     with pytest.raises(Interrupted):
-        start_on_turntable(even, masked, tiny_options(), CPU, 1, lambda: True)
+        start_on_turntable(even, masked, tiny_recipe(), lambda: True)
 
 
 def test_the_likeliest_elevation_is_the_top_of_a_parabola_through_uneven_tries():

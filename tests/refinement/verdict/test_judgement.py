@@ -11,6 +11,7 @@ from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.images import ImageSet, load_images
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.perturb import perturb_poses
+from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.verdict.image_flags import blurred, exposure_off, moved_far, sharpness
 from biresnerf.refinement.verdict.judgement import Judgement, judge_poses
 from biresnerf.refinement.verdict.pose_evidence import compare_on_matches, working_share
@@ -245,7 +246,7 @@ def test_outliers_in_exposure_and_motion_are_flagged_and_they_alone():
 def test_trainings_are_the_same_again(scene):
     dataset, images = scene
     trials = pose_trials.PoseTrials(
-        images, [2, 6], [dataset.world_from_cam], OPTIONS, 20, CPU, 2, lambda: False
+        images, [2, 6], [dataset.world_from_cam], Recipe.of(OPTIONS, CPU, 2), 20, lambda: False
     )
     first, again = trials.score(dataset.world_from_cam), trials.score(dataset.world_from_cam)
     np.testing.assert_array_equal(first.psnr, again.psnr)

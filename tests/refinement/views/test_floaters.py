@@ -11,6 +11,7 @@ import torch
 from biresnerf.data.synthetic.scene import CAMERA_ANGLE_X
 from biresnerf.geometry.similarity import Similarity
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.scene.scene_frame import SceneFrame
 from biresnerf.refinement.verdict.run_report import held_out_report
 from biresnerf.refinement.views.evaluation import score_views
@@ -35,7 +36,7 @@ def optimiser_of(images, formula, held_out=()) -> JointOptimiser:
     poses[1, 0, 3] = APART
     poses[3:, :3, :3] = np.diag([-1.0, 1.0, -1.0])
     frame = SceneFrame(Similarity.identity(), True, 1.0, 1e-3, 60.0, None)
-    optimiser = JointOptimiser(images, frame, poses, tiny_options(), list(held_out), CPU, threads=2)
+    optimiser = JointOptimiser(images, frame, poses, Recipe.of(tiny_options(), CPU, 2), list(held_out))
     optimiser.field = AnalyticField(formula, unbounded=True)
     return optimiser
 
