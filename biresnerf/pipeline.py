@@ -37,8 +37,7 @@ from biresnerf.refinement.optimise.methods import Method, Recipe
 from biresnerf.refinement.parameters.rigid_bodies import rigid_bodies
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.checkpoint import SEEDING, TRACKS, Checkpoint, RunOrigin
-from biresnerf.refinement.stages.observer import Observer
-from biresnerf.refinement.stages.two_stages import TwoStages
+from biresnerf.refinement.stages.two_stages import Observer, TwoStages
 from biresnerf.refinement.start.choose_start import find_start
 from biresnerf.refinement.start.first_step import first_step, stage_lengths
 from biresnerf.refinement.verdict.evaluate import Evaluation, evaluate
@@ -107,7 +106,7 @@ def _refine(input: str | Path | Dataset, setup: _Setup, observer: Observer | Non
     scene, origin = _seed(dataset, setup)
     stages = _first_step(scene, origin, setup, observer)
     keep_to_budget(stages, started, setup.recipe.options.steps)
-    stages.record.seconds["preparing"] = time.monotonic() - started
+    stages.spent("preparing", time.monotonic() - started)
 
     evaluation, judgement = Evaluation(), None
     try:
@@ -118,7 +117,8 @@ def _refine(input: str | Path | Dataset, setup: _Setup, observer: Observer | Non
         evaluation = evaluate(stages, pictures)
         judgement = judge(stages)
         if judgement is not None:
-            evaluation.views = pictures.write_before_after(evaluation.views, judgement.renders)
+            shown = pictures.write_before_after(evaluation.views, judgement.renders)
+            evaluation = replace(evaluation, views=shown)
         known = pose_uncertainty(stages, finish, judgement)
         report = run_report(stages, evaluation.scores, judgement, "complete", finish, known)
         report = write_result(setup.folder, stages, evaluation, report)

@@ -200,3 +200,48 @@ def imported(package: str) -> dict[str, str]:
 def test_a_package_imports_only_what_its_installation_brings(package, extras):
     missing = {name: file for name, file in imported(package).items() if name not in declared(*extras)}
     assert missing == {}
+
+
+RUN_ROOMS = ("optimise", "views", "start", "lost", "stages", "finish", "verdict")
+OF_A_RUN = [
+    *(path for room in RUN_ROOMS for path in sorted((ROOT / "biresnerf/refinement" / room).glob("*.py"))),
+    *sorted((ROOT / "biresnerf/write").glob("*.py")), ROOT / "biresnerf/pipeline.py",
+]  # fmt: skip
+
+
+def foreign_writes(code: str) -> list[str]:
+    """Assignments to attributes, or to items of attributes, of anything but `self`'s own."""
+    found = []
+    for node in ast.walk(ast.parse(code)):
+        targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+        if not isinstance(node, ast.Assign | ast.AugAssign | ast.AnnAssign):
+            continue
+        for target in (each for t in targets for each in (t.elts if isinstance(t, ast.Tuple) else [t])):
+            while isinstance(target, ast.Subscript):
+                target = target.value
+            if isinstance(target, ast.Attribute) and ast.unparse(target.value) != "self":
+                found.append(f"{node.lineno}: {ast.unparse(target)}")
+    return found
+
+
+def test_whatever_has_state_in_a_run_changes_it_itself():
+    found = {path.relative_to(ROOT).as_posix(): foreign_writes(path.read_text()) for path in OF_A_RUN}
+    assert {path: writes for path, writes in found.items() if writes} == {}
+
+
+@pytest.mark.parametrize(
+    "code",
+    ["stages.ends = 1", "a, b.poses = 1, 2", "run.record.seconds['x'] += 1", "self.optimiser.rays //= 2"],
+    ids=["attribute", "one of two", "item", "through an attribute"],
+)
+def test_a_write_into_another_object_is_found(code):
+    assert len(foreign_writes(code)) == 1
+    assert foreign_writes("self.ends = 1; found = 2; table[0] = 3; self.sums[0] = 4") == []
+
+
+def test_no_module_of_the_method_imports_another_for_its_types_alone():
+    """Such imports hide circles from the contracts."""
+    hidden = [
+        path for path in (ROOT / "biresnerf/refinement").rglob("*.py") if "TYPE_CHECKING" in path.read_text()
+    ]
+    assert hidden == []

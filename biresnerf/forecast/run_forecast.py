@@ -83,6 +83,14 @@ class Forecast:
         self._when: dict[Unit, tuple[float, float]] = {}  # from when to when
         self._fraction = 0.0
 
+    def plan(self, step_weights: Mapping[Phase, float], share: float) -> None:
+        """So many units of work are in a step of either stage, and so many of the steps asked for will be taken."""
+        self.step_weights, self.share = dict(step_weights), share
+
+    def expect(self, amounts: Mapping[Phase, float], *, alone: bool = False) -> None:
+        """So much is left of these phases, and nothing of others where they are ``alone``."""
+        self.left = dict(amounts) if alone else {**self.left, **amounts}
+
     def pauses(self, seconds: float) -> None:
         """What took so long, as the compilation of kernels, is no part of the run: the next will not have it."""
         self._began += seconds

@@ -27,8 +27,7 @@ from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.method_changes import changed
 from biresnerf.refinement.optimise.methods import find_method
 from biresnerf.refinement.stages.checkpoint import CHECKPOINT
-from biresnerf.refinement.stages.observer import Observer
-from biresnerf.refinement.stages.two_stages import TwoStages
+from biresnerf.refinement.stages.two_stages import Observer, TwoStages
 from biresnerf.refinement.views.image_metrics import psnr, ssim
 from biresnerf.report import Report
 from biresnerf.studies.cell import (

@@ -105,7 +105,7 @@ class SeedingPreview:
             return
         if not self._counted:
             self._counted = True
-            forecast.left |= matching_work(list(found.features.values()), found.pairs)
+            forecast.expect(matching_work(list(found.features.values()), found.pairs))
         phase: Phase = "mapping" if found.matched else "matching"
         forecast.enter(phase)
         for earlier in PHASES[: PHASES.index(phase)]:

@@ -40,22 +40,23 @@ def adjust_cameras(stages: TwoStages, *, moves: bool = True) -> Finish:
         found = choose_poses(stages.scene, optimiser, partial(_announce, stages))
     if found is None:
         return Finish()
-    chosen, finish = found
+    chosen, finish, focals = found
+    optimiser.lenses.be_certain(focals)
     if not moves:
         return finish
     if finish.heeds_photos:
-        stages.forecast.left["adjusting"] = 0.0  # unless photos object
+        stages.forecast.expect({"adjusting": 0.0})  # unless photos object
     cameras, lenses = optimiser.lenses.refined(stages.scene.dataset).cameras, chosen.lenses
     if lenses is not None:
         cameras = corrected_cameras(cameras, lenses.correction) or cameras
     asked = chosen.name not in ("refined", *BY_PATCHES)
     if asked and photos_object(stages, chosen.world_from_cam, cameras):
         logger.info("the photos contradict these poses, which are not taken")
-        optimiser.lenses.certainty = certainty
+        optimiser.lenses.be_certain(certainty)
         return finish.refused()
     if chosen.name != "refined":
         stages.place(chosen.world_from_cam)
-        optimiser.poses_held = True
+        optimiser.hold_poses()
     if lenses is not None:
         optimiser.lenses.place(stages.scene.dataset.cameras, cameras)
     return finish

@@ -34,6 +34,7 @@ from biresnerf.refinement.finish.lens_evidence import contradicted_focals, focal
 from biresnerf.refinement.finish.lens_model import supported_lenses
 from biresnerf.refinement.finish.outcome import Finish, fit_of, heeded, most_heeded
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.parameters.intrinsics_parameters import FocalCertainty
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.report import CandidateName
 
@@ -49,10 +50,10 @@ TOLD_APART = 2.0
 
 def choose_poses(
     scene: Scene, optimiser: JointOptimiser, announce: Callable[[], None]
-) -> tuple[Candidate, Finish] | None:
-    """The best candidate, in the unit frame, and how it was found; None where no evidence can tell.
+) -> tuple[Candidate, Finish, tuple[FocalCertainty | None, ...]] | None:
+    """The best candidate, in the unit frame, how it was found, and what is known of each camera's focal length.
 
-    What the evidence says of the lenses goes to the optimiser's.
+    None where no evidence can tell.
     """
     gathered = gather_evidence(scene, optimiser)
     refined = optimiser.poses.poses().numpy()
@@ -96,12 +97,12 @@ def choose_poses(
         chosen = as_candidate(chosen.name, result, heeded_now, cameras) or chosen
     best = results.get(chosen.name) or next(iter(results.values()), None)
     kept = given_focals(scene.dataset, optimiser.options.refine_intrinsics)
-    optimiser.lenses.certainty = focal_certainty(
+    focals = focal_certainty(
         best,
         split.fitted,
         contradicted_focals(refined, split.fitted, split.left_out, prior, noise, kept, by_tracks),
     )
-    return chosen, Finish(choice.reports, fit_of(candidates, results, evidence), given)
+    return chosen, Finish(choice.reports, fit_of(candidates, results, evidence), given), focals
 
 
 def _adjusted(

@@ -35,8 +35,9 @@ def run_stage_2(stages: TwoStages) -> Finish:
         if stages.optimiser.poses_held:
             stages.optimiser.end_after(LEARNING)
         again = not _is_over(stages, first) and _time_to_adjust_again(stages)
-        did = {"adjusted": True, "candidates": first.candidates, "believed": first.fit is not None}
-        stages.record = stages.record.model_copy(update={**did, "adjusts_again": again})
+        stages.note(
+            adjusted=True, candidates=first.candidates, believed=first.fit is not None, adjusts_again=again
+        )
         expect_as_measured(stages)
         stages.replan()
     stages.run_stage_2()

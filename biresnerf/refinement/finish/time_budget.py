@@ -24,10 +24,11 @@ def keep_to_budget(stages: TwoStages, started: float, steps_asked: int) -> None:
     What it took before it was interrupted counts.
     """
     seconds = stages.optimiser.options.time_budget_s
-    stages.plan = expect_as_measured
-    if seconds:
-        stages.ends = started + (1 - WRITING) * seconds - sum(stages.record.seconds.values())
-        stages.plan = partial(choose_steps, most=steps_asked)
+    if not seconds:
+        stages.keep_to(expect_as_measured)
+        return
+    ends = started + (1 - WRITING) * seconds - sum(stages.record.seconds.values())
+    stages.keep_to(partial(choose_steps, most=steps_asked), ends)
 
 
 def budget_warnings(stages: TwoStages) -> tuple[str, ...]:

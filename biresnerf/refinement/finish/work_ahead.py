@@ -26,8 +26,8 @@ def expect_run(forecast: Forecast, dataset: Dataset, recipe: Recipe) -> None:
     unbounded = load_images(few, SMALL, options.background).background is None
     adjusts = adjusts_cameras(as_views(dataset), recipe.method)
     work = workload(dataset, options, unbounded=unbounded, adjusts=adjusts)
-    forecast.step_weights, forecast.share = dict(work.step_weights), work.share
-    forecast.left |= work.amounts
+    forecast.plan(work.step_weights, work.share)
+    forecast.expect(work.amounts)
 
 
 def expect_rest(stages: TwoStages) -> None:
@@ -35,15 +35,15 @@ def expect_rest(stages: TwoStages) -> None:
     forecast, optimiser = stages.forecast, stages.optimiser
     forecast.leave()
     forecast.continues(sum(stages.record.seconds.values()))
-    forecast.step_weights = step_weights(optimiser.options, unbounded=optimiser.frame.unbounded)
-    matched = stages.scene.tracks is not None
-    forecast.share = steps_share(matched=matched and adjusts_cameras(stages.scene.dataset, optimiser.method))
-    forecast.left = work_ahead(stages)
+    adjusts = adjusts_cameras(stages.scene.dataset, optimiser.method)
+    share = steps_share(matched=stages.scene.tracks is not None and adjusts)
+    forecast.plan(step_weights(optimiser.options, unbounded=optimiser.frame.unbounded), share)
+    forecast.expect(work_ahead(stages), alone=True)
 
 
 def expect_as_measured(stages: TwoStages) -> None:
     """The rest of a run on its way, as its poses and what it has done tell it now."""
-    stages.forecast.left |= work_ahead(stages)
+    stages.forecast.expect(work_ahead(stages))
 
 
 def work_ahead(

@@ -275,7 +275,7 @@ class LostCameraRepair:
     def load_state(self, state: RepairState) -> None:
         self.repaired, self._times, self._spent = list(state.repaired), state.times, state.spent
         for camera in self.repaired:
-            self.optimiser.mobility[:, self.optimiser.poses.members(camera)] = 1.0
+            self.optimiser.free(camera)
 
 
 def _distinct(matrices: Tensor, scores: Tensor, keep: int) -> Tensor:

@@ -31,9 +31,7 @@ def step_that_fits(optimiser: JointOptimiser) -> StepResult:
             if optimiser.batch_share <= LEAST_SHARE:
                 raise
         # After the handler, as the error's traceback holds the step's tensors.
-        optimiser.batch_share /= 2
-        optimiser.rays = max(optimiser.method.rays_least, optimiser.rays // 2)
-        optimiser.field.release_memory()
+        optimiser.halve_batch()
         torch.cuda.empty_cache()
         logger.warning("%s", smaller_batches(optimiser)[0])
 

@@ -19,7 +19,7 @@ from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.refinement.optimise.async_metrics import AsyncMetrics, StepResult
 from biresnerf.refinement.optimise.camera_errors import CameraErrors
 from biresnerf.refinement.optimise.cast_rays import turned, viewing_directions
-from biresnerf.refinement.optimise.joint_step import joint_step, step_numbers
+from biresnerf.refinement.optimise.joint_step import StepNumbers, joint_step
 from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.optimise.optimiser_state import Part, StepState, load_state_of, state_of
 from biresnerf.refinement.optimise.photo_sampler import PhotoSampler
@@ -47,6 +47,7 @@ class JointOptimiser:
         bodies: which cameras move together, and which not at all; by default each moves independently.
         lenses: the intrinsics, where they may move; by default those of the images.
         sampler: of the same images and held-out views, if another optimiser has one already.
+        poses: in place of poses that move freely from the start poses.
     """
 
     def __init__(
@@ -60,6 +61,7 @@ class JointOptimiser:
         bodies: RigidBodies | None = None,
         lenses: IntrinsicsParameters | None = None,
         sampler: PhotoSampler | None = None,
+        poses: PoseParameters | None = None,
     ) -> None:
         options, device, threads = recipe.options, recipe.device, recipe.threads
         self.frame, self.options, self.device, self.threads = frame, options, device, threads
@@ -67,7 +69,7 @@ class JointOptimiser:
         self.method = recipe.method
         self.field = self.method.build_field(options, frame, device, threads)
         self.lenses = lenses or IntrinsicsParameters.held(images.cameras, device)
-        self.poses = self._pose_parameters(torch.from_numpy(unit_from_cam))
+        self.poses = poses if poses is not None else self._pose_parameters(torch.from_numpy(unit_from_cam))
         self.schedule = self.method.schedule(options, frame.pixel, frame.unbounded, frame.distance)
         self._images = images
         self.sampler = sampler or PhotoSampler(images, held_out, device, self.method.by_detail)
@@ -127,7 +129,21 @@ class JointOptimiser:
         self.poses.replace(camera, unit_from_cam)
         self.camera_errors.forget(camera)
         self.exposure.forget(camera)
+        self.free(camera)
+
+    def free(self, camera: int) -> None:
+        """Let a camera, and those that move with it, move in both stages."""
         self.mobility[:, self.poses.members(camera)] = 1.0
+
+    def hold_poses(self) -> None:
+        """Poses and lenses stay as they are from now on."""
+        self.poses_held = True
+
+    def halve_batch(self) -> None:
+        """Steps have half of the samples from now on."""
+        self.batch_share /= 2
+        self.rays = max(self.method.rays_least, self.rays // 2)
+        self.field.release_memory()
 
     def marching(self, interval: float) -> Marching:
         near, far = self.schedule.near(self.step_index, self.switch), self.schedule.far(self.frame.far)
@@ -178,12 +194,26 @@ class JointOptimiser:
         self.field.reach(t / schedule.steps)
         if t % OCCUPANCY_PERIOD == 0 and self.method.pruned:
             self._update_occupancy(t)
-        told = step_numbers(self)
+        told = self._numbers()
         done = joint_step(self, told)
         self.step_index += 1
         self._adapt_rays(done.samples, int(self.batch_share * schedule.samples(t, self.switch)))
         loss, error = self.metrics.read(done.loss, done.error)
         return StepResult(loss, error, told.rays, done.samples)
+
+    def _numbers(self) -> StepNumbers:
+        t, switch, schedule = self.step_index, self.switch, self.schedule
+        held = self.poses_held or not self.lenses.moving
+        return StepNumbers(
+            rays=self.rays,
+            marching=self.marching(schedule.interval(t, switch)),
+            gradient=schedule.position_gradient(t, switch),
+            rates=schedule.field_rates(t, switch),
+            blur=schedule.blur(t, switch, self.sampler.long_side),
+            pose_rate=self.pose_rate(),
+            lens_rate=0.0 if held else schedule.lens_rate(t, switch),
+            moves_focal=schedule.focal_moves(switch),
+        )
 
     def pose_rate(self) -> float:
         """Learning rate of the poses at this step."""

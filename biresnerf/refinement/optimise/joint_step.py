@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
+import torch
 from torch import Tensor
 
-from biresnerf.field.radiance_field import FieldRates, Marching, PositionGradient
+from biresnerf.field.backends import Directions
+from biresnerf.field.radiance_field import FieldRates, Marching, PositionGradient, RadianceField, Rays
+from biresnerf.refinement.optimise.camera_errors import CameraErrors
 from biresnerf.refinement.optimise.cast_rays import cast_rays, viewing_directions
-from biresnerf.refinement.optimise.photo_sampler import PixelBatch
-
-if TYPE_CHECKING:
-    from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.optimise.methods import Method
+from biresnerf.refinement.optimise.photo_sampler import PhotoSampler, PixelBatch
+from biresnerf.refinement.parameters.exposure import Exposure
+from biresnerf.refinement.parameters.intrinsics_parameters import IntrinsicsParameters
+from biresnerf.refinement.parameters.pose_parameters import PoseParameters
 
 
 @dataclass(frozen=True)
@@ -43,25 +47,25 @@ class StepOutcome:
     samples: int
 
 
-def step_numbers(optimiser: JointOptimiser) -> StepNumbers:
-    """What the next step is told."""
-    t, switch, schedule = optimiser.step_index, optimiser.switch, optimiser.schedule
-    rate = optimiser.pose_rate()
-    held = optimiser.poses_held or not optimiser.lenses.moving
-    lens_rate = 0.0 if held else schedule.lens_rate(t, switch)
-    return StepNumbers(
-        rays=optimiser.rays,
-        marching=optimiser.marching(schedule.interval(t, switch)),
-        gradient=schedule.position_gradient(t, switch),
-        rates=schedule.field_rates(t, switch),
-        blur=schedule.blur(t, switch, optimiser.sampler.long_side),
-        pose_rate=rate,
-        lens_rate=lens_rate,
-        moves_focal=schedule.focal_moves(switch),
-    )
+class Trained(Protocol):
+    """What a step reads and moves; see `JointOptimiser`."""
+
+    field: RadianceField
+    poses: PoseParameters
+    lenses: IntrinsicsParameters
+    exposure: Exposure
+    camera_errors: CameraErrors
+    sampler: PhotoSampler
+    directions: Directions
+    draws: torch.Generator
+    mobility: Tensor
+    method: Method
+    switch: int | None
+
+    def over_background(self, origin: Tensor, direction: Tensor, trained: int, *, jitter: bool) -> Rays: ...
 
 
-def joint_step(optimiser: JointOptimiser, told: StepNumbers) -> StepOutcome:
+def joint_step(optimiser: Trained, told: StepNumbers) -> StepOutcome:
     """Draw pixels, render them, and move field, poses, lenses and exposures by the gradients of the loss."""
     field, poses, exposure = optimiser.field, optimiser.poses, optimiser.exposure
     moves_poses, moves_lenses = told.pose_rate > 0, told.lens_rate > 0
@@ -72,7 +76,7 @@ def joint_step(optimiser: JointOptimiser, told: StepNumbers) -> StepOutcome:
     if moves_lenses:
         matrices, lenses = optimiser.lenses.with_gradient(matrices)
     else:
-        lenses = optimiser.intrinsics
+        lenses = optimiser.lenses.intrinsics
     in_cam = viewing_directions(optimiser.directions, lenses, batch.image, batch.xy)
     origin, direction = cast_rays(matrices, batch.image, in_cam)
     rays = optimiser.over_background(origin, direction, batch.trained, jitter=True)
@@ -94,7 +98,7 @@ def joint_step(optimiser: JointOptimiser, told: StepNumbers) -> StepOutcome:
     return StepOutcome(loss.detach() + poses.zero_if_finite(), error, rendering.samples)
 
 
-def _loss(optimiser: JointOptimiser, colour: Tensor, batch: PixelBatch) -> Tensor:
+def _loss(optimiser: Trained, colour: Tensor, batch: PixelBatch) -> Tensor:
     weight, of_camera = batch.weight, optimiser.camera_errors.weights
     if of_camera is not None and optimiser.method.weights:
         weight = weight * of_camera[batch.image]

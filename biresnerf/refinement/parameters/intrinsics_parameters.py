@@ -211,6 +211,10 @@ class IntrinsicsParameters:
         self.given = replace(self.given, terms=(above, below, tangential))
         self._present = None
 
+    def be_certain(self, certainty: tuple[FocalCertainty | None, ...]) -> None:
+        """What is known of each focal length from now on."""
+        self.certainty = certainty
+
     def at(self, increments: Tensor) -> IntrinsicsParameters:
         """These lenses at another moment's increments [cameras, columns]: to be looked at, not to be stepped."""
         other = copy(self)

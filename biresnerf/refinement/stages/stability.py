@@ -50,6 +50,10 @@ class StabilityDetector:
     decibels: list[float] = field(default_factory=list)
     confirmed: int = 0
 
+    def keep_between(self, floor: int, cap: int) -> None:
+        """No switch before step `floor`; always at step `cap`."""
+        self.floor, self.cap = floor, cap
+
     def still_deg(self, pose_rate: float, steps: int) -> float:
         """Rotation within a block of `steps` steps that settled cameras may show at this learning rate (rad)."""
         return max(self.motion_deg, STAGGER * math.degrees(pose_rate) * math.sqrt(steps))

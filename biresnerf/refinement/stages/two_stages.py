@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +34,6 @@ from biresnerf.refinement.stages.checkpoint import (
     save_checkpoint,
     track_tensors,
 )
-from biresnerf.refinement.stages.observer import Observer
 from biresnerf.refinement.stages.stability import StabilityDetector
 from biresnerf.refinement.stages.timing import Part, PreviewTimer, StageName
 from biresnerf.stages import ReusableStage
@@ -44,6 +44,21 @@ REPORT_PERIOD_S = 0.5
 MEASURED_STEPS = 20  # of a stage, after which it is known how long they take
 
 
+@dataclass(frozen=True)
+class Observer:
+    """Looks into a run on its way; the run does not depend on what it sees.
+
+    Attributes:
+        at_check: what it returns at each check joins that check's line of the history.
+        at_end: called once, when the poses are final.
+        write_preview: shows the state of the run in files, and returns these relative to the output folder.
+    """
+
+    at_check: Callable[[JointOptimiser], dict[str, float]] = lambda _optimiser: {}
+    at_end: Callable[[TwoStages], None] = lambda _stages: None
+    write_preview: Callable[[TwoStages], tuple[str, ...]] = lambda _stages: ()
+
+
 class TwoStages:
     """Runs a `JointOptimiser` to its last step; can stop after any step and continue from a checkpoint.
 
@@ -52,8 +67,6 @@ class TwoStages:
         origin: what the run was started with; goes into every checkpoint.
 
     Attributes:
-        plan: called when it is known how long the steps of a stage take, after cameras were adjusted, and at each
-            check of stage 2; it may change how many steps the run takes.
         ends: of `time.monotonic`, when the run is to end.
     """
 
@@ -69,7 +82,7 @@ class TwoStages:
         self.optimiser, self.scene, self.folder, self.origin = optimiser, scene, folder, origin
         self.monitor, self.observer = monitor or Monitor(), observer
         self.forecast = self.monitor.forecast
-        self.plan: Callable[[TwoStages], None] = lambda _stages: None
+        self._plan: Callable[[TwoStages], None] = lambda _stages: None
         self.ends = math.inf
         self.record, self.history = RunRecord(), History(folder)
         self.repair = LostCameraRepair(optimiser, OwnMatches.of(scene))
@@ -110,14 +123,31 @@ class TwoStages:
         self._save()
         self.monitor.report(self._progress(CHECKPOINT.as_posix(), preview))
 
+    def keep_to(self, plan: Callable[[TwoStages], None], ends: float = math.inf) -> None:
+        """Plan the rest of the run anew whenever more is known of it, to end by so much of `time.monotonic`.
+
+        Args:
+            plan: called when it is known how long the steps of a stage take, after cameras were adjusted, and at each
+                check of stage 2; it may change how many steps the run takes.
+        """
+        self._plan, self.ends = plan, ends
+
+    def note(self, **happened: object) -> None:
+        """Put into the record what has happened."""
+        self.record = self.record.model_copy(update=happened)
+
+    def spent(self, part: str, seconds: float) -> None:
+        """A part of the run has taken so long in all."""
+        self.note(seconds={**self.record.seconds, part: seconds})
+
     def replan(self) -> None:
         """The rest of the run may become shorter or longer: how long it takes has been measured."""
-        self.plan(self)
+        self._plan(self)
         self._take_lengths()
 
     def _take_lengths(self) -> None:
         options = self.optimiser.options
-        self.detector.floor, self.detector.cap = options.coarse_steps_min, options.coarse_steps_max
+        self.detector.keep_between(options.coarse_steps_min, options.coarse_steps_max)
 
     def steps_left(self, steps: int, cap: int) -> tuple[int, int]:
         """Of stage 1, at most, and of stage 2, in a run of so many steps whose stage 1 has at most `cap`."""
@@ -144,7 +174,7 @@ class TwoStages:
         started = time.monotonic()
         with self.forecast.within(phase or part, amount):
             yield
-        self.record.seconds[part] = self.record.seconds.get(part, 0.0) + time.monotonic() - started
+        self.spent(part, self.record.seconds.get(part, 0.0) + time.monotonic() - started)
 
     def report_evaluation(self, share: float, step: int = 0, steps_total: int = 0, message: str = "") -> None:
         """Report how much is done of the part that the run is in, after the stages."""
@@ -173,7 +203,7 @@ class TwoStages:
         if at_cap or optimiser.step_index % options.check_every == 0:
             self._check(result)
         now = time.monotonic()
-        self.record.seconds[stage] += now - started
+        self.spent(stage, self.record.seconds[stage] + now - started)
         preview = self._preview() if self._previews.due else ()  # first: the checkpoint holds what it found
         checkpoint = None
         if now - self._saved >= options.checkpoint_every_s:
@@ -208,7 +238,7 @@ class TwoStages:
         self._write_history(error, last)
         if verdict != "running":
             self._repair(switching=True)
-            self.record = self.record.model_copy(update={"switch_reason": verdict})
+            self.note(switch_reason=verdict)
             logger.info("stage 2 begins at step %d (%s)", optimiser.step_index, verdict)
             self._signal = {}
             self._save(ends_stage_1=True)
@@ -296,4 +326,4 @@ class TwoStages:
             optimiser.start_reconstruction()
             return
         self.detector.load_state(checkpoint.detector)
-        self.record = self.record.model_copy(update={"resumed": self.record.resumed + 1})
+        self.note(resumed=self.record.resumed + 1)

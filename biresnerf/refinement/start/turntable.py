@@ -87,9 +87,10 @@ class RingTrials:
             samples_per_step=min(SAMPLES, self._recipe.options.samples_per_step),
         )
         poses = self.frame.unit_from_world.apply_to_poses(ring.matrices())
-        optimiser = JointOptimiser(self.images, self.frame, poses, short, self.unseen, sampler=self._sampler)
         moving = RingParameters(ring, self.frame.distance, self._run, self._recipe.device)
-        optimiser.poses = moving
+        optimiser = JointOptimiser(
+            self.images, self.frame, poses, short, self.unseen, sampler=self._sampler, poses=moving
+        )
         for _ in range(TRY_STEPS):
             if self._should_stop():
                 raise Interrupted("stopped while rings of cameras were tried")

@@ -61,7 +61,7 @@ def poses_so_far(stages: TwoStages) -> SoFar:
             verdict=verdict,
             gain=gain if best is None else max(gain, best.gain),
         )
-        stages.record = stages.record.model_copy(update={"best": best})
+        stages.note(best=best)
         return SoFar(now, verdict)
     if best is None:
         return SoFar(now, verdict)

@@ -123,7 +123,8 @@ class PoseTrials:
         optimiser = JointOptimiser(
             images, self.frame, poses, self._recipe, self.unseen, sampler=self._sampler
         )
-        optimiser.poses_held = not moving
+        if not moving:
+            optimiser.hold_poses()
         return Trial(optimiser, images, self.unseen, self.steps, self._should_stop)
 
 

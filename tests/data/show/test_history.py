@@ -7,8 +7,7 @@ import json
 from biresnerf.data.show.history import HISTORY, History, read_history
 from biresnerf.progress import Monitor
 from biresnerf.refinement.stages.checkpoint import load_checkpoint
-from biresnerf.refinement.stages.observer import Observer
-from biresnerf.refinement.stages.two_stages import TwoStages
+from biresnerf.refinement.stages.two_stages import Observer, TwoStages
 from tests.refinement.tiny_scene import finished, given_scene, tiny_optimiser, tiny_options, tiny_set
 
 

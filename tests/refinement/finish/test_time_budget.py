@@ -101,7 +101,7 @@ def test_time_that_an_adjustment_leaves_goes_to_the_field_at_the_poses_it_found(
 def test_a_run_is_planned_again_at_each_check_of_stage_2(scene, tmp_path):
     stages = stages_of(scene, tmp_path, steps=120, coarse_steps_min=10, coarse_steps_max=20, check_every=10)
     planned = []
-    stages.plan = lambda found: planned.append(found.optimiser.step_index)
+    stages.keep_to(lambda found: planned.append(found.optimiser.step_index))
     assert finished(stages)
     switch = stages.optimiser.switch
     due = {step for step in range(switch + 1, 121) if step % 10 == 0} | {
