@@ -25,7 +25,7 @@ def changed(method: Method, changes: Mapping[str, Any]) -> Method:
 
 def _with(holder: Any, path: list[str], value: Any, asked: str) -> Any:
     name, *rest = path
-    if not is_dataclass(holder) or name not in _names(holder):
+    if not is_dataclass(holder) or isinstance(holder, type) or name not in _names(holder):
         raise InputError("invalid_options", "is no field of the method.", where=f"method.{asked}")
     if rest:
         found = _with(getattr(holder, name), rest, value, asked)
