@@ -59,3 +59,9 @@ print(*cpu_target.target_context.codegen().magic_tuple())
     ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert ran.stdout.split() == [*cpu_target.target_context.codegen().magic_tuple()]
     assert "-prefer-256-bit" in ran.stdout
+
+
+@pytest.mark.parametrize("part", ["render", "rest", "adjustment"])
+def test_the_processes_that_a_run_starts_compile_without_an_error(part: str):
+    """An error there would show only in time: the run itself would compile."""
+    subprocess.run([sys.executable, "-m", "biresnerf.compile_kernels", part], check=True)
