@@ -1,5 +1,6 @@
 """A run on a busy machine teaches the next forecast nothing wrong: two whole runs, one of them beside seven others."""
 
+import json
 import os
 import signal
 import subprocess
@@ -10,7 +11,7 @@ import pytest
 
 from biresnerf.commands.poses.inspect import expected_seconds
 from biresnerf.data.formats.read_dataset import read_dataset
-from biresnerf.forecast.rates import machine_rates
+from biresnerf.forecast.rates import RATES_FILE, machine_rates
 from biresnerf.options.refine_options import RefineOptions
 
 pytestmark = [
@@ -37,6 +38,12 @@ def times(monkeypatch: pytest.MonkeyPatch, scene: Path, memory: Path) -> dict[st
     return expected_seconds(read_dataset(scene), RefineOptions(threads=1))
 
 
+def remembered(memory: Path) -> dict[str, float]:
+    """The one rate of each unit in a memory, as it was measured: predictions believe it only up to a limit."""
+    machines = json.loads((memory / "biresnerf" / RATES_FILE).read_text())
+    return {unit: rates[0] for unit, rates in machines["cpu 1"].items()}
+
+
 def test_predictions_after_a_run_at_load_8_stay_within_twofold(tmp_path, monkeypatch):
     scene, core = tmp_path / "scene", min(os.sched_getaffinity(0))
     biresnerf("make-scene", scene, "--views", 8, "--size", 64, memory=tmp_path)
@@ -52,6 +59,9 @@ def test_predictions_after_a_run_at_load_8_stay_within_twofold(tmp_path, monkeyp
     finally:
         for one in started:
             os.kill(int(one.stdout), signal.SIGKILL)
+    usual, found = remembered(tmp_path / "alone"), remembered(tmp_path / "busy")
+    for step in ("coarse step", "fine step"):
+        assert usual[step] / 2 < found[step] < 2 * usual[step]
     alone, busy = times(monkeypatch, scene, tmp_path / "alone"), times(monkeypatch, scene, tmp_path / "busy")
     for preset, (least_s, most_s) in alone.items():
         assert least_s / 2 < busy[preset][0] < 2 * least_s

@@ -98,18 +98,18 @@ def test_photos_alone_are_shown_at_once_then_what_matches_then_the_poses(photos:
 
 def test_what_is_left_of_matching_follows_from_the_features_found_and_mapping_stays_mapping(photos, tmp_path):
     monitor = Monitor()
-    left = monitor.forecast.left = {"features": 1.0, "matching": 1.0, "mapping": 1.0}
+    monitor.forecast.left = {"features": 1.0, "matching": 1.0, "mapping": 1.0}
     counts = dict.fromkeys(range(VIEWS), 2000)
     with SeedingPreview(read_dataset(photos), OutputFolder(tmp_path / "out"), monitor) as show:
         show(SeedingProgress({0: 2000, 1: 2000}, {}, 0, 45))
-        assert (left["matching"], left["mapping"]) == (1.0, 1.0)
+        assert monitor.forecast.left == {"features": 1.0, "matching": 1.0, "mapping": 1.0}
         show(SeedingProgress(counts, {}, 9, 45))
         mapping = VIEWS * (EACH_MAPPED + 2)
-        assert left == {"matching": pytest.approx(45 * 2000 / 1e6), "mapping": mapping}
+        assert monitor.forecast.left == {"matching": pytest.approx(45 * 2000 / 1e6), "mapping": mapping}
         show(SeedingProgress(counts, {(0, 1): 90}, 45, 45, matched=True))
-        assert left == {"mapping": mapping}
+        assert monitor.forecast.left == {"mapping": mapping}
         show(SeedingProgress(counts, {}, 20, 45, matched=True))  # contradicting pairs were taken out
-        assert left == {"mapping": mapping}
+        assert monitor.forecast.left == {"mapping": mapping}
         assert monitor.forecast.left_s() > 0
 
 

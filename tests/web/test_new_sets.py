@@ -110,7 +110,7 @@ def test_a_checked_set_shows_its_photos_and_cameras_and_leaves_photos_out(
     )
     plan = page.get_by_role("region", name="What will happen")
     expect(plan).to_contain_text("Your poses are the start.")
-    expect(plan).to_contain_text(re.compile(r"about \d+(\.\d)? (s|min|h) on this machine"))
+    expect(plan).to_contain_text(re.compile(r"about \d+( s)?( to \d+)? (s|min|h) on this machine"))
     stage, shown = page.get_by_role("application"), page.get_by_role("checkbox", name="Photos", exact=True)
     shown.uncheck()
     bare = stage.screenshot()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Callable
 from functools import partial
@@ -14,7 +15,8 @@ HEIGHT, PER_LETTER, MARGIN = 20, 6.7, 7  # px
 def badges(root: Path) -> dict[Path, Callable[[], str]]:
     """What writes each badge."""
     project = tomllib.loads((root / "pyproject.toml").read_text("utf-8"))["project"]
-    python = project["requires-python"].removeprefix(">=").partition(",")[0]
+    pythons = re.findall(r"Python :: (3\.\d+)", "\n".join(project["classifiers"]))
+    python = f"{pythons[0]} to {pythons[-1]}"
     said = {"version": project["version"], "python": python, "licence": project["license"]}
     return {
         root / f"docs/pictures/badge_{name}.svg": partial(badge, name, value) for name, value in said.items()
