@@ -9,8 +9,9 @@ import sys
 
 import pytest
 
-from biresnerf.progress import Progress
-from biresnerf.run.show_progress import LINE_EVERY, ShownProgress
+from biresnerf.forecast.run_forecast import RATES, Forecast
+from biresnerf.progress import Monitor, Progress
+from biresnerf.run.show_progress import LINE_EVERY, ShownProgress, in_words
 
 
 class Terminal(io.StringIO):
@@ -61,3 +62,14 @@ def test_a_file_has_lines_without_control_characters(monkeypatch):
     assert lines[1].startswith("coarse ")
     assert "\r" not in said
     assert len(lines) == 4  # of 41 reports
+
+
+@pytest.mark.parametrize(
+    ("share", "words"), [(0.5, "1:01 left (the machine is busy now)"), (0.9, "1:01 left")]
+)
+def test_the_time_left_says_that_the_machine_is_busy(share: float, words: str):
+    told: list[Progress] = []
+    monitor = Monitor(told.append, forecast=Forecast(RATES, lambda _began, _ended: share))
+    monitor.forecast.left = {"evaluating": 61 / RATES["evaluation"]}
+    monitor.report(Progress(stage="evaluating", metrics={"loss": 0.5}))
+    assert in_words(told[0]) == f"loss 0.50000  {words}"
