@@ -60,13 +60,19 @@ def arguments(name: str, *, views: int, size: int, **options: Any) -> Arguments:
     parser.add_argument("--views", type=int, default=views)
     parser.add_argument("--size", type=int, default=size, help="width of the images, px")
     parser.add_argument("--set", dest="settings", action="append", default=[], metavar="KEY=VALUE")
-    given = parser.parse_args([] if "ipykernel" in sys.modules else None)
+    given = parser.parse_args([] if _in_notebook() else None)
     options |= parse_settings(tuple(given.settings))
     try:
         parse_options(options)
     except InputError as error:
         parser.error(str(error))
     return Arguments(given.output, given.of, given.views, given.size, options)
+
+
+def _in_notebook() -> bool:
+    """Whether IPython runs this; that something imported it says nothing."""
+    ipython = sys.modules.get("IPython")
+    return ipython is not None and ipython.get_ipython() is not None
 
 
 def in_words(result: Result) -> str:

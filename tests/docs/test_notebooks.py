@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
@@ -25,9 +24,7 @@ def test_a_notebook_runs_from_its_first_cell_to_its_last(
     path = ROOT / "examples" / f"{name}.ipynb"
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(path.parent)
-    # A kernel has arguments of its own, which are none of the walk's.
-    monkeypatch.setattr(sys, "argv", ["ipykernel_launcher.py", "-f", "kernel-1.json"])
-    monkeypatch.setitem(sys.modules, "ipykernel", ModuleType("ipykernel"))
+    monkeypatch.setattr(sys, "argv", [f"{name}.py"])
     namespace = {"__name__": "__main__"}
     with small_runs():
         for cell in json.loads(path.read_text("utf-8"))["cells"]:
@@ -37,6 +34,24 @@ def test_a_notebook_runs_from_its_first_cell_to_its_last(
     said = capsys.readouterr().out
     assert "of which the COLMAP model in sparse/0 has 4" in said
     assert [line.split()[0] for line in said.splitlines()[-2:]] == ["given", "refined"]
+
+
+def test_a_walk_takes_the_arguments_of_a_script_and_none_of_a_kernel(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("nbclient")
+    pytest.importorskip("ipykernel")  # which loads IPython, as other tests of this process may
+    from docs.generate.run_notebooks import executed
+
+    monkeypatch.syspath_prepend(ROOT / "examples")
+    monkeypatch.setattr(sys, "argv", ["phone_capture.py", "--output", "elsewhere"])
+    from walk import arguments
+
+    assert arguments("phone_capture", views=1, size=1).output == Path("elsewhere")
+    walk = f"import sys\nsys.path.insert(0, {str(ROOT / 'examples')!r})\nfrom walk import arguments\n"
+    code = "print(len(sys.argv) > 1, arguments('phone_capture', views=1, size=1).output)"
+    (cell,) = code_cells(executed(notebook(written(tmp_path, walk + code))))
+    assert cell["outputs"][0]["text"] == ["True phone_capture\n"], "a kernel has arguments of its own"
 
 
 def code_cells(text: str) -> list[dict[str, Any]]:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import time
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -52,25 +53,35 @@ def test_a_job_that_waits_too_long_expires_and_its_follower_is_told(http: httpx.
 def test_a_job_is_stopped_at_its_deadline_and_keeps_what_it_has(
     http: httpx.Client, scene: Path, form: bool
 ) -> None:
-    options = '{"preset": "fast", "steps": 4000, "seed": 20}'
-    dataset = "" if form else ready_dataset(http, scene)
-    archive = zip_of(scene_files(scene))
-    deadline = later(12)
+    for seconds in (12.0, 60.0):  # a busy machine may take the whole of 12 s to begin
+        job = stopped_job(http, scene, later(seconds), form)
+        if job is not None and job["partial"]:
+            break
+    assert job is not None, "60 s did not suffice to begin it"
+    assert (job["state"], job["partial"], job["error"]["code"]) == ("cancelled", True, "deadline_passed")
+    assert job["finished_at"] >= job["deadline_at"]
+    assert http.get(job["links"]["report"]).status_code == 200
+    assert http.post(f"/v1/jobs/{job['id']}/links", json={}).status_code == 201, "it can be shown"
+
+
+def stopped_job(http: httpx.Client, scene: Path, deadline: str, form: bool) -> dict[str, Any] | None:
+    """A long job that is over, as the deadline has passed; None where it passed before the job was there."""
+    body = {"deadline_at": deadline, "expires_in_queue_s": 600}
+    options = {"preset": "fast", "steps": 4000, "seed": 20}
     if form:
-        texts = {"options": options, "deadline_at": deadline, "expires_in_queue_s": "60"}
-        answer = http.post("/v1/jobs", files={"archive": ("a.zip", archive)}, data=texts)
+        archive = {"archive": ("a.zip", zip_of(scene_files(scene)))}
+        answer = http.post("/v1/jobs", files=archive, data={**body, "options": json.dumps(options)})
     else:
-        body = {"dataset_id": dataset, "options": {"preset": "fast", "steps": 4000, "seed": 20}}
-        answer = http.post("/v1/jobs", json={**body, "deadline_at": deadline, "expires_in_queue_s": 60})
+        body |= {"dataset_id": ready_dataset(http, scene), "options": options}
+        answer = http.post("/v1/jobs", json=body)
+    if answer.status_code == 422 and datetime.now(UTC) > datetime.fromisoformat(deadline):
+        problem(answer, 422, "deadline_refused")
+        return None
     assert answer.status_code == 202, answer.text
     asked = answer.json()
     assert datetime.fromisoformat(asked["deadline_at"]) == datetime.fromisoformat(deadline)
     assert asked["start_by"] == asked["deadline_at"], "the earlier of both"
-    job = until(http, asked["id"], over)
-    assert (job["state"], job["partial"], job["error"]["code"]) == ("cancelled", True, "deadline_passed")
-    assert job["finished_at"] >= asked["deadline_at"]
-    assert http.get(job["links"]["report"]).status_code == 200
-    assert http.post(f"/v1/jobs/{job['id']}/links", json={}).status_code == 201, "it can be shown"
+    return until(http, asked["id"], over, 120)
 
 
 def test_a_deadline_that_has_passed_is_refused_and_leaves_no_dataset(http: httpx.Client, scene: Path) -> None:
