@@ -41,7 +41,10 @@ NEEDED = {
     "hypothesis": ("hypothesis", "sortedcontainers"),
 }
 PRESETS = "fast,balanced,paper"
-GPU_TESTS = ("tests/field/cuda", "tests/field/test_device_occupancy.py", "tests/refinement/optimise")
+_OF_STEPS = (
+    f"tests/refinement/optimise/test_{name}.py" for name in ("cuda_step", "async_metrics", "device_memory")
+)
+GPU_TESTS = ("tests/field/cuda", "tests/field/test_device_occupancy.py", *_OF_STEPS)
 VERSIONS = """
 import importlib.metadata as m, platform, torch
 print("Python", platform.python_version(), platform.platform())
@@ -73,15 +76,18 @@ def parts(asked: argparse.Namespace, work: Path) -> Iterator[Part]:
     yield Part("kernels", (*python, "biresnerf.field.cuda.device_check", asked.device), 300)
     if asked.device == "cuda":
         yield Part("steps", (*python, "benchmarks.gpu.cuda_step"), 300)
+        yield Part("whole-steps", (*python, "benchmarks.gpu.whole_step", "--profile"), 300)
     yield Part("scene", (*biresnerf, "make-scene", str(scene), "--views", asked.views, "--size", "400"), 300)
-    for path in (*asked.sets, scene):
+    for path in (*asked.sets, *([scene] if scene.exists() else [])):
         for preset in asked.presets.split(","):
             output = work / f"{path.name}-{preset}"
             run = (*biresnerf, "compare", str(path), "-o", str(output), "--preset", preset, *settings)
             yield Part("runs", run, asked.run_limit)
     if asked.device == "cuda":
         yield Part("profile", (*python, "benchmarks.gpu.cuda_step", "--profile"), 300)
-        yield Part("tests", (*python, "pytest", "-q", "-n", "0", *GPU_TESTS), 600)
+        # Without the project's settings, which want plugins that these tests do not need.
+        alone = ("-c", os.devnull, "--rootdir", str(ROOT), "-p", "no:cacheprovider")
+        yield Part("tests", (*python, "pytest", "-q", *alone, *GPU_TESTS), 600)
 
 
 def missing() -> list[str]:
@@ -94,8 +100,8 @@ def missing() -> list[str]:
     ]
 
 
-def gather(folder: Path, python: str) -> None:
-    """Fill a folder with wheels for another Linux machine with that Python."""
+def gather(folder: Path, python: str, only: list[str]) -> None:
+    """Fill a folder with wheels, of some packages or all, for another Linux machine with that Python."""
     target = (
         "--python-version",
         python,
@@ -104,7 +110,7 @@ def gather(folder: Path, python: str) -> None:
         "--platform",
         "manylinux2014_x86_64",
     )
-    packages = (name for names in NEEDED.values() for name in names)
+    packages = only or [name for names in NEEDED.values() for name in names]
     constraints = ("-c", str(ROOT / "constraints.txt"), "--only-binary", ":all:", "--no-deps", *target)
     download = (sys.executable, "-m", "pip", "download", "-q", "-d", str(folder), *constraints, *packages)
     subprocess.run(download, check=True)
@@ -156,9 +162,10 @@ def main() -> None:
     parser.add_argument("--wheels", type=Path, help="a folder of wheels with what is missing here")
     parser.add_argument("--gather", type=Path, help="only fill such a folder, for --python")
     parser.add_argument("--python", default="3.12")
+    parser.add_argument("--only", metavar="PACKAGE,...", help="those that a report named as missing")
     asked = parser.parse_args()
     if asked.gather:
-        gather(asked.gather, asked.python)
+        gather(asked.gather, asked.python, asked.only.split(",") if asked.only else [])
         return
     asked.sets = [path.resolve() for path in asked.sets]
     with tempfile.TemporaryDirectory() as folder, asked.out.open("w") as report:
