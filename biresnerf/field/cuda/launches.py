@@ -69,8 +69,7 @@ class Plan:
         self._ran = False
 
     def run(self) -> None:
-        # A graph of the whole step cannot hold another one: it records the launches themselves.
-        if self._graph is not None and not torch.cuda.is_current_stream_capturing():
+        if self._graph is not None:
             self._graph.replay()
             return
         for launch in self.launches:

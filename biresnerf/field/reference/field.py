@@ -19,6 +19,7 @@ class ReferenceField(GridField):
     """Backend `reference`."""
 
     backend = "reference"
+    product = staticmethod(torch.matmul)  # of the networks
 
     def __init__(self, shape: FieldShape, seed: int, device: torch.device) -> None:
         super().__init__(shape, seed, device)
@@ -66,19 +67,19 @@ class ReferenceField(GridField):
         for parameter in parameters:
             parameter.requires_grad_(trained)
         features, weights = self._features(x, gradient)
-        result = reference.network(features, view, weights)
+        result = reference.network(features, view, weights, self.product)
         for parameter in parameters:
             parameter.requires_grad_()
         return result
 
     @torch.no_grad()
     def density(self, position: Tensor) -> Tensor:
-        return reference.density(*self._features(position, PositionGradient()))
+        return reference.density(*self._features(position, PositionGradient()), self.product)
 
     @torch.no_grad()
     def estimate(self, position: Tensor, count: Tensor | None = None) -> Tensor:
         features = reference.encode(position, self.pose_table, self.shape.pose_grid)
-        return reference.density(features, self.networks)
+        return reference.density(features, self.networks, self.product)
 
     @torch.no_grad()
     def _update_table(self, name: str, rates: np.ndarray) -> None:

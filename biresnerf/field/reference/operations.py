@@ -6,12 +6,15 @@ Any device, any float type, differentiable by autograd. Written to be read, not 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from biresnerf.field.grid_levels import HASH_PRIMES, GridLevels
 from biresnerf.field.radiance_field import Merging
+
+Product = Callable[[Tensor, Tensor], Tensor]  # of two matrices
 
 DENSITY_SHIFT, DENSITY_CAP = 1.0, 11.0
 EDGE = 1e-6
@@ -54,21 +57,24 @@ def encode(x: Tensor, table: Tensor, grid: GridLevels, smoothing: float = 0.0) -
     return torch.cat(features, 1)
 
 
-def network(features: Tensor, view: Tensor, weights: list[Tensor]) -> tuple[Tensor, Tensor]:
+def network(
+    features: Tensor, view: Tensor, weights: list[Tensor], product: Product = torch.matmul
+) -> tuple[Tensor, Tensor]:
     """Density [n] and colour [n, 3] of features [n, width] and view harmonics [n, 16].
 
     `weights` = (64 x width, 16 x 64) of the density network and (64 x 32, 64 x 64, 3 x 64) of the colour network,
     no biases, rectified; density = exp(min(z0 - 1, 11)) of the first output (BAA-NGP's truncated exponential).
     """
     w1, w2, w3, w4, w5 = weights
-    outputs = torch.relu(features @ w1.T) @ w2.T
-    colour = torch.relu(torch.relu(torch.cat([view, outputs], 1) @ w3.T) @ w4.T) @ w5.T
+    outputs = product(torch.relu(product(features, w1.T)), w2.T)
+    hidden = torch.relu(product(torch.cat([view, outputs], 1), w3.T))
+    colour = product(torch.relu(product(hidden, w4.T)), w5.T)
     return density_of(outputs[:, 0]), torch.sigmoid(colour)
 
 
-def density(features: Tensor, weights: list[Tensor]) -> Tensor:
+def density(features: Tensor, weights: list[Tensor], product: Product = torch.matmul) -> Tensor:
     """The density [n] of `network` alone."""
-    return density_of((torch.relu(features @ weights[0].T) @ weights[1].T)[:, 0])
+    return density_of(product(torch.relu(product(features, weights[0].T)), weights[1].T)[:, 0])
 
 
 def density_of(logit: Tensor) -> Tensor:

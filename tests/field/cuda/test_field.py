@@ -15,11 +15,10 @@ pytest.importorskip("triton", reason="the CUDA backend's kernels need Triton, wh
 from biresnerf.errors import InputError
 from biresnerf.field.cuda import field as cuda_field
 from biresnerf.field.cuda import plans
-from biresnerf.field.cuda.check_batch import learn
+from biresnerf.field.cuda.check_batch import DefinedField, learn
 from biresnerf.field.cuda.field import CudaField
 from biresnerf.field.radiance_field import Merging, PositionGradient
 from biresnerf.field.reference import operations as reference
-from biresnerf.field.reference.field import ReferenceField
 from tests.field.cuda.fields import (
     DEVICE,
     HAS_GPU,
@@ -55,7 +54,7 @@ MANY = 33 if HAS_GPU else 10  # rays; more than a program takes, but for the int
 )
 def test_values_and_all_gradients_equal_the_reference(unbounded, reconstructing, count, trained, merging):
     gradient = PositionGradient(1.0, 0.5, 0.7)
-    fields = make(ReferenceField, unbounded, reconstructing), make_fast(unbounded, reconstructing)
+    fields = make(DefinedField, unbounded, reconstructing), make_fast(unbounded, reconstructing)
     results = []
     for field in fields:
         rays = make_rays(count, trained, unbounded)
@@ -141,7 +140,7 @@ def test_marching_finds_the_live_intervals_of_the_reference(unbounded):
 
 def test_the_same_launches_serve_other_rays_and_settings():
     """What a graph replays: nothing that changes from step to step may be bound into a launch."""
-    fast, slow = make_fast(), make(ReferenceField)
+    fast, slow = make_fast(), make(DefinedField)
     steps = [
         (MANY, MANY - 4, make_marching(0.12), PositionGradient(1.0, 1.0, 0.0)),
         (7, 7, make_marching(0.08, share=0.7, far=2.5), PositionGradient(0.0, 0.3, 1.0)),
@@ -164,7 +163,7 @@ def test_the_same_launches_serve_other_rays_and_settings():
 
 
 def test_a_view_in_parts_equals_the_reference():
-    fast, slow = make_fast(samples=60), make(ReferenceField)
+    fast, slow = make_fast(samples=60), make(DefinedField)
     rays, marching = make_rays(10), make_marching(0.2, share=0.9)
     with torch.no_grad():
         expected = slow.render(rays, marching, PositionGradient())
@@ -209,7 +208,7 @@ def test_no_rays_and_no_live_samples_give_background_and_zero_gradient():
 
 
 def test_density_and_its_estimate_equal_the_reference_also_in_parts():
-    fast, slow = make_fast(True, samples=128), make(ReferenceField, True)
+    fast, slow = make_fast(True, samples=128), make(DefinedField, True)
     x = torch.rand(300, 3, generator=torch.Generator().manual_seed(2)).to(DEVICE)
     torch.testing.assert_close(fast.density(x), slow.density(x), rtol=TOLERANCE, atol=1e-4)
     torch.testing.assert_close(fast.estimate(x), slow.estimate(x), rtol=TOLERANCE, atol=1e-4)
