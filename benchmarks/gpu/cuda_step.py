@@ -1,6 +1,7 @@
 """One optimisation step of the field on a GPU: the Triton kernels against the plain-torch definition.
 
-``python -m benchmarks.gpu.cuda_step`` prints a JSON line for each stage; with ``--profile``, where a step's time goes.
+``python -m benchmarks.gpu.cuda_step`` prints a JSON line for each stage; with ``--profile``, where a step's time goes;
+with ``--waiting``, the kernel that faults, as the host waits for each one.
 """
 
 from __future__ import annotations
@@ -9,10 +10,12 @@ import argparse
 import json
 import statistics
 import time
+from collections.abc import Iterator
 
 import torch
 
 from biresnerf.field.cuda.field import CudaField
+from biresnerf.field.cuda.launches import Launch, Plan
 from biresnerf.field.grid_levels import grid_levels
 from biresnerf.field.radiance_field import (
     FieldRates,
@@ -61,11 +64,11 @@ def _steps(field: RadianceField, rays: int, steps: int, occupied: torch.Tensor) 
     return (time.perf_counter() - started) / steps, samples
 
 
-def run(rays: int, rounds: int) -> list[dict[str, float | str | int]]:
-    """Rows for stage 1 and stage 2 at the paper's encodings (Table 1), T = 2^19: medians, in turn."""
+def run(rays: int, rounds: int) -> Iterator[dict[str, float | str | int]]:
+    """A row for stage 1 and stage 2 at the paper's encodings (Table 1), T = 2^19: medians, in turn."""
     shape = FieldShape(grid_levels(3, 16, 72, 22), grid_levels(LEVELS, 128, 4096, 19), unbounded=False)
     kernels, plain = CudaField(shape, 0, DEVICE), ReferenceField(shape, 0, DEVICE)
-    occupied, rows = _shell(), []
+    occupied = _shell()
     for stage in ("coarse", "fine"):
         if stage == "fine":
             kernels.start_reconstruction()
@@ -75,17 +78,33 @@ def run(rays: int, rounds: int) -> list[dict[str, float | str | int]]:
         pairs = [
             (_steps(kernels, rays, 50, occupied), _steps(plain, rays, 2, occupied)) for _ in range(rounds)
         ]
-        rows.append(
-            {
-                "stage": f"{stage} cuda",
-                "samples": pairs[-1][1][1],
-                "kernels_ms": 1e3 * statistics.median(fast for (fast, _), _ in pairs),
-                "torch_ms": 1e3 * statistics.median(slow for _, (slow, _) in pairs),
-                "ratio": statistics.median(slow / fast for (fast, _), (slow, _) in pairs),
-                "kernels_ns_per_sample": 1e9 * statistics.median(fast / n for (fast, n), _ in pairs),
-            }
-        )
-    return rows
+        yield {
+            "stage": f"{stage} cuda",
+            "samples": pairs[-1][1][1],
+            "kernels_ms": 1e3 * statistics.median(fast for (fast, _), _ in pairs),
+            "torch_ms": 1e3 * statistics.median(slow for _, (slow, _) in pairs),
+            "ratio": statistics.median(slow / fast for (fast, _), (slow, _) in pairs),
+            "kernels_ns_per_sample": 1e9 * statistics.median(fast / n for (fast, n), _ in pairs),
+        }
+
+
+def wait_for_each_launch() -> None:
+    """Let a fault show at the kernel that has it. Nothing is recorded as a graph."""
+
+    def launch_and_wait(launch: Launch) -> None:
+        launch.kernel[launch.grid](**launch.arguments, num_warps=launch.warps, num_stages=1)
+        try:
+            torch.cuda.synchronize()
+        except RuntimeError as error:
+            shapes = {name: getattr(value, "shape", value) for name, value in launch.arguments.items()}
+            print(
+                f"{launch.kernel.fn.__name__} {launch.grid}: {str(error).splitlines()[0]}\n{shapes}",
+                flush=True,
+            )
+            raise
+
+    Launch.__call__ = launch_and_wait  # type: ignore[method-assign]
+    Plan.record = lambda plan: None  # type: ignore[method-assign]
 
 
 def profile(rays: int) -> str:
@@ -105,8 +124,12 @@ def profile(rays: int) -> str:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--profile", action="store_true")
-    if parser.parse_args().profile:
+    parser.add_argument("--waiting", action="store_true")
+    asked = parser.parse_args()
+    if asked.waiting:
+        wait_for_each_launch()
+    if asked.profile:
         print(profile(8192))
     else:
         for row in run(8192, 5):
-            print(json.dumps(row))
+            print(json.dumps(row), flush=True)

@@ -23,6 +23,7 @@ import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TextIO
 
 ROOT = Path(__file__).resolve().parents[2]
 # What a refinement and the tests import, and the packages that bring it. `imageio-ffmpeg` reads videos only.
@@ -87,7 +88,7 @@ def parts(asked: argparse.Namespace, work: Path) -> Iterator[Part]:
         yield Part("profile", (*python, "benchmarks.gpu.cuda_step", "--profile"), 300)
         # Without the project's settings, which want plugins that these tests do not need.
         alone = ("-c", os.devnull, "--rootdir", str(ROOT), "-p", "no:cacheprovider")
-        yield Part("tests", (*python, "pytest", "-q", *alone, *GPU_TESTS), 600)
+        yield Part("tests", (*python, "pytest", "-v", "--tb=short", *alone, *GPU_TESTS), 600)
 
 
 def missing() -> list[str]:
@@ -127,22 +128,22 @@ def environment(asked: argparse.Namespace, work: Path) -> dict[str, str]:
     return os.environ | interpreter | {"PYTHONPATH": path.rstrip(os.pathsep), "PYTHONUNBUFFERED": "1"}
 
 
-def run(part: Part, variables: dict[str, str]) -> tuple[str, str]:
-    """How a part ended, and what it printed."""
+def run(part: Part, variables: dict[str, str], report: TextIO) -> str:
+    """How a part ended; what it prints is in the report at once, whatever becomes of this process."""
     try:
         done = subprocess.run(
             part.command,
             cwd=ROOT,
             env=variables,
-            stdout=subprocess.PIPE,
+            stdout=report,
             stderr=subprocess.STDOUT,
             timeout=part.limit_s,
         )
-    except subprocess.TimeoutExpired as error:
-        return f"not done after {part.limit_s:g} s", (error.stdout or b"").decode(errors="replace")
+    except subprocess.TimeoutExpired:
+        return f"not done after {part.limit_s:g} s"
     except FileNotFoundError as error:
-        return "not there", str(error)
-    return f"exit status {done.returncode}", done.stdout.decode(errors="replace")
+        return f"not there: {error}"
+    return f"exit status {done.returncode}"
 
 
 def main() -> None:
@@ -176,12 +177,11 @@ def main() -> None:
             if asked.parts and part.name not in asked.parts.split(","):
                 continue
             print(part.name, *part.command)
+            report.write(f"===== {part.name}\n$ {' '.join(part.command)}\n")
+            report.flush()
             began = time.monotonic()
-            status, output = run(part, variables)
-            seconds = time.monotonic() - began
-            report.write(
-                f"## {part.name}: {status}, {seconds:.1f} s\n$ {' '.join(part.command)}\n{output}\n\n"
-            )
+            status = run(part, variables, report)
+            report.write(f"{part.name}: {status}, {time.monotonic() - began:.1f} s\n\n")
             report.flush()
     print(f"see {asked.out}")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -12,8 +13,8 @@ pytest.importorskip("triton", reason="the CUDA backend's kernels need Triton, wh
 
 from biresnerf.field import backends
 from biresnerf.field.cuda import device_check
+from biresnerf.field.cuda.check_batch import CutProduct, DefinedField
 from biresnerf.field.cuda.field import CudaField
-from biresnerf.field.reference.field import ReferenceField
 from biresnerf.geometry.camera.camera import directions_in_cam
 from biresnerf.refinement.verdict import run_report
 from tests.field.cuda.fields import DEVICE, HAS_GPU, SHAPES
@@ -28,18 +29,34 @@ def test_kernels_that_compute_what_is_defined_have_no_faults(monkeypatch):
     assert device_check.faults(CudaField, DEVICE) == ()
 
 
-class WrongDensity(ReferenceField):
+def test_a_product_cuts_its_factors_and_those_of_its_gradients_to_ten_bits():
+    def cut(x):  # towards zero, by another way than the bits
+        mantissa, exponent = np.frexp(x.double().numpy())
+        return torch.from_numpy(np.ldexp(np.trunc(mantissa * 2**11) / 2**11, exponent))
+
+    draws = torch.Generator().manual_seed(1)
+    a, b, g = (torch.randn(n, m, generator=draws) for n, m in ((5, 7), (7, 3), (5, 3)))
+    a.requires_grad_(), b.requires_grad_()
+    product = CutProduct.apply(a, b)
+    product.backward(g)
+    whole, other, back = (cut(x.detach()) for x in (a, b, g))
+    assert not torch.allclose(product.double(), a.double() @ b.double(), rtol=1e-5, atol=1e-5)
+    for found, expected in ((product, whole @ other), (a.grad, back @ other.T), (b.grad, whole.T @ back)):
+        torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=1e-6)
+
+
+class WrongDensity(DefinedField):
     def density(self, position):
         return 1.1 * super().density(position)
 
 
-class WrongTables(ReferenceField):
+class WrongTables(DefinedField):
     def _update_table(self, name, rates):
         super()._update_table(name, rates)
         self.moments[name][0].mul_(1.1)
 
 
-class NaNDepth(ReferenceField):
+class NaNDepth(DefinedField):
     def render(self, rays, marching, gradient):
         rendering = super().render(rays, marching, gradient)
         return replace(rendering, depth=rendering.depth * float("nan"))
@@ -50,7 +67,7 @@ class NaNDepth(ReferenceField):
     [(WrongDensity, "density"), (WrongTables, "gradient by tables"), (NaNDepth, "depth")],
 )
 def test_a_wrong_result_is_named(kind, named):
-    found = device_check.faults(kind, torch.device("cpu"))
+    found = device_check.faults(kind, DEVICE)
     assert len(found) == 4  # in either stage, of either kind of scene
     assert all(fault.startswith(named) for fault in found)
 
@@ -58,7 +75,7 @@ def test_a_wrong_result_is_named(kind, named):
 def test_wrong_viewing_directions_are_named(monkeypatch):
     turned = lambda *pixels: directions_in_cam(*pixels) + 1e-4  # noqa: E731
     monkeypatch.setattr(device_check, "on_device", turned)
-    assert device_check.faults(ReferenceField, torch.device("cpu")) == ("viewing directions differ",)
+    assert device_check.faults(DefinedField, DEVICE) == ("viewing directions differ",)
 
 
 def test_each_gpu_is_checked_once(tmp_path, monkeypatch):
