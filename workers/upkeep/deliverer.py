@@ -85,6 +85,8 @@ class Deliverer(LeasedWork):
 
     async def _send(self, row: dict[str, Any]) -> None:
         found = await self._jobs.artifacts(row["job_id"])
+        if not found:  # as of a job that ended before it ran
+            raise TransferFailed("The job has no files.", code="not_found")
         if row["name"] is None:
             size, chunks, kind = zip_bytes(found), zipped(self._files, found), "application/zip"
             if size > ZIP_BYTES_MAX:

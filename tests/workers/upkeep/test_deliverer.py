@@ -110,16 +110,18 @@ async def test_what_fails_is_said_and_goes_to_new_addresses_when_asked_again(
         assert await addresses(stores) == 0
 
 
-async def test_a_job_that_was_cancelled_sends_what_it_has(
+async def test_a_job_that_never_ran_sends_no_empty_zip_but_says_that_it_has_no_files(
     stores: Stores, settings: Settings, dispatchers: Dispatchers
 ):
     async with Receiver().open() as receiver:
-        job = await submitted(stores, DeliverTo(archive=receiver.url))
+        job = await submitted(stores, DeliverTo(archive=receiver.url, files={"log.txt": receiver.url}))
         dispatchers.start()
         await stores.jobs.cancel(job.id)
-        assert (await over(stores, job))[None].state == "delivered"
-        with zipfile.ZipFile(io.BytesIO(receiver.messages[0].body)) as archive:
-            assert archive.namelist() == []
+        for item in (await over(stores, job)).values():
+            assert item.error is not None
+            assert (item.state, item.error.code) == ("failed", "not_found")
+            assert "The job has no files." in item.error.detail
+        assert receiver.messages == []
 
 
 @pytest.mark.parametrize("url", ["http://10.0.0.1/a", "http://169.254.169.254/a", "gopher://127.0.0.1/a"])
@@ -135,12 +137,12 @@ async def test_an_address_inside_is_refused_with_the_job(stores: Stores, url: st
 
 
 async def test_a_name_that_leads_inside_gets_nothing(
-    stores: Stores, settings: Settings, dispatchers: Dispatchers
+    stores: Stores, settings: Settings, slots: Slots, dispatchers: Dispatchers
 ):
     async with Receiver().open() as receiver:
         job = await submitted(stores, DeliverTo(archive=receiver.url))
         dispatchers.start(settings.model_copy(update={"file_address_networks": ()}))
-        await stores.jobs.cancel(job.id)
+        slots.start(settings, "cpu0")
         assert (await over(stores, job))[None].error.code == "address_refused"
         assert receiver.messages == []
 
@@ -156,11 +158,11 @@ async def test_a_repeated_request_with_other_addresses_is_the_same_job_and_keeps
 
 
 async def test_what_a_killed_dispatcher_was_sending_is_sent_by_the_next_and_the_second_loss_ends_it(
-    stores: Stores, settings: Settings, dispatchers: Dispatchers
+    stores: Stores, settings: Settings, slots: Slots, dispatchers: Dispatchers
 ):
     async with Receiver(None, b"200 OK").open() as receiver:
         job = await submitted(stores, DeliverTo(archive=receiver.url))
-        await stores.jobs.cancel(job.id)
+        slots.start(settings, "cpu0")
         killed = dispatchers.start_process()
         await receiver.heard(1)
         killed.kill()
@@ -172,7 +174,7 @@ async def test_what_a_killed_dispatcher_was_sending_is_sent_by_the_next_and_the_
             lost = "UPDATE job_deliveries SET token = %s, leased_until = now(), losses = 1, due_at = now()"
             connection.execute(lost, (uuid.uuid4(),))
         said = (await over(stores, job))["log.txt"].error
-        assert said.code in {"delivery_failed", "not_found"}
+        assert (said.code, len(receiver.messages)) == ("delivery_failed", 2)
 
 
 async def test_a_deleted_job_sends_nothing_and_an_export_has_no_files_of_its_own(
