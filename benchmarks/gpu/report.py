@@ -4,8 +4,9 @@ Runs from a plain checkout; nothing has to be installed but torch, Triton, Numba
 named, and found in ``--wheels FOLDER``, which ``--gather FOLDER`` fills on a machine with a network. Each part is a
 process with a limit; whatever happens to it, the next one follows, and the file is written as it goes. In this order:
 
-machine, kernels against the definition, ms a step against plain torch, whole runs of each SET and a made scene with
-noisy poses in each preset, a profile of the kernels, and the tests that need a GPU.
+machine, kernels against the definition, ms a step of the field against plain torch and of the whole optimisation, whole
+runs of each SET and a made scene with noisy poses in each preset, a profile of the kernels, and the tests that need a
+GPU.
 
 With ``--device cpu`` the same command runs without a GPU: kernels in Triton's interpreter, and runs on the CPU.
 """
@@ -42,10 +43,13 @@ NEEDED = {
     "hypothesis": ("hypothesis", "sortedcontainers"),
 }
 PRESETS = "fast,balanced,paper"
-_OF_STEPS = (
-    f"tests/refinement/optimise/test_{name}.py" for name in ("cuda_step", "async_metrics", "device_memory")
+GPU_TESTS = (
+    "tests/field/cuda",
+    "tests/field/test_device_occupancy.py",
+    "tests/refinement/optimise/test_async_metrics.py",
+    "tests/refinement/optimise/test_cuda_step.py",
+    "tests/refinement/optimise/test_device_memory.py",
 )
-GPU_TESTS = ("tests/field/cuda", "tests/field/test_device_occupancy.py", *_OF_STEPS)
 VERSIONS = """
 import importlib.metadata as m, platform, torch
 print("Python", platform.python_version(), platform.platform())
