@@ -71,6 +71,8 @@ class Client:
     ready = _blocking(AsyncClient.ready)
     info = _blocking(AsyncClient.info)
     options = _blocking(AsyncClient.options)
+    usage = _blocking(AsyncClient.usage)
+    operator = _blocking(AsyncClient.operator)
 
     create_dataset = _blocking(AsyncClient.create_dataset)
     dataset = _blocking(AsyncClient.dataset)

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from datetime import date
+
 from biresnerf.client.downloads import Downloads
 from biresnerf.client.errors import ServiceError
 from biresnerf.client.events import Events
 from biresnerf.client.submission import Submissions
 from biresnerf.client.transport import Call, parse
 from biresnerf.client.webhook_calls import WebhookCalls
-from biresnerf.wire.service import Info, OptionsView
+from biresnerf.wire.operator import OperatorView
+from biresnerf.wire.service import Info, OptionsView, UsageKey, UsageList, UsageRow
 
 
 class AsyncClient(Submissions, Events, Downloads, WebhookCalls):
@@ -34,3 +38,18 @@ class AsyncClient(Submissions, Events, Downloads, WebhookCalls):
     async def options(self) -> OptionsView:
         """The JSON Schema of the options, and every preset with its values."""
         return parse(await self._ask(Call("GET", "/v1/options")), OptionsView)
+
+    async def usage(
+        self, *, first: date | None = None, last: date | None = None, by: Sequence[UsageKey] = ("day",)
+    ) -> tuple[UsageRow, ...]:
+        """Processor and GPU seconds used from the day ``first`` to ``last`` (UTC), split ``by``.
+
+        Of the caller's tenant, or of all with the scope `admin`. By default the last 30 days.
+        """
+        days = {name: day.isoformat() for name, day in (("from", first), ("to", last)) if day}
+        answer = await self._ask(Call("GET", "/v1/usage", {"by": ",".join(by), **days}))
+        return parse(answer, UsageList).items
+
+    async def operator(self) -> OperatorView:
+        """The installation at work: queue, slots, sizes, the latest failures. Needs the scope `admin`."""
+        return parse(await self._ask(Call("GET", "/v1/operator")), OperatorView)

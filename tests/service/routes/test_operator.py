@@ -10,6 +10,7 @@ from typing import Any
 import httpx
 import pytest
 
+from biresnerf.client import Client, ServiceError
 from tests.service.conftest import (
     Running,
     client_with,
@@ -41,6 +42,21 @@ def seen(http: httpx.Client) -> dict[str, Any]:
     answer = http.get("/v1/operator")
     assert answer.status_code == 200, answer.text
     return answer.json()
+
+
+def test_the_client_shows_it_to_operators_alone(
+    closed: Running, admin: httpx.Client, user: httpx.Client
+) -> None:
+    def client(http: httpx.Client) -> Client:
+        return Client(closed.url, api_key=http.headers["authorization"].removeprefix("Bearer "))
+
+    with client(admin) as allowed, client(user) as refused:
+        assert [slot.name for slot in allowed.operator().slots] == [
+            slot["name"] for slot in seen(admin)["slots"]
+        ]
+        with pytest.raises(ServiceError) as error:
+            refused.operator()
+    assert error.value.code == "scope_required"
 
 
 def test_a_key_without_the_scope_admin_is_refused(user: httpx.Client) -> None:

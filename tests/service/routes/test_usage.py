@@ -14,6 +14,7 @@ from typing import Any
 import httpx
 import pytest
 
+from biresnerf.client import Client
 from tests.service.conftest import (
     Running,
     client_with,
@@ -121,6 +122,16 @@ def test_csv_says_the_same(users: Users, wish: dict[str, Any]) -> None:
 )
 def test_what_cannot_be_asked_is_refused(users: Users, asked: dict[str, str]) -> None:
     problem(users.first.get("/v1/usage", params=asked), 422, "invalid_request")
+
+
+def test_the_client_asks_for_the_same(closed: Running, users: Users) -> None:
+    today = datetime.now(UTC).date()
+    key = users.first.headers["authorization"].removeprefix("Bearer ")
+    with Client(closed.url, api_key=key) as client:
+        found = client.usage(by=("day", "key"))
+        assert [row.model_dump(mode="json") for row in found] == rows(users.first, by="day,key")
+        assert client.usage(last=today - timedelta(days=1)) == ()
+        assert client.usage(first=today + timedelta(days=1), last=today + timedelta(days=2)) == ()
 
 
 def test_metrics_count_by_tenant(users: Users) -> None:
