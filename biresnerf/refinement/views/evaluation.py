@@ -62,14 +62,16 @@ def fit_held_out_poses(optimiser: JointOptimiser, held_out: list[int]) -> None:
     if held:  # what is seen of the field stays the same
         with torch.no_grad():
             batch, rendering = _seen_by_held_out(optimiser, CHUNK)
-    for step in range(FIT_STEPS):
+    # Not longer than the field was trained, or a short run would take longer to measure than to do.
+    steps = FIT_STEPS if held else min(FIT_STEPS, optimiser.options.steps)
+    for step in range(steps):
         if not held:
             batch, rendering = _seen_by_held_out(optimiser, fit_rays(optimiser))
         colour = exposure.forgiven(exposure.shown(rendering, batch.image), batch.sharp)
         (optimiser.method.loss(colour, batch.sharp) * batch.weight[:, None]).mean().backward()
         if not held:
-            poses.step(FIT_RATE * 0.1 ** (step / FIT_STEPS), mobility)
-        exposure.step(FIT_EXPOSURE_RATE * 0.1 ** (step / FIT_STEPS))
+            poses.step(FIT_RATE * 0.1 ** (step / steps), mobility)
+        exposure.step(FIT_EXPOSURE_RATE * 0.1 ** (step / steps))
 
 
 def _seen_by_held_out(optimiser: JointOptimiser, rays: int) -> tuple[PixelBatch, Rendering]:

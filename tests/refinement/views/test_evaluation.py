@@ -165,6 +165,15 @@ def test_fitting_held_out_poses_moves_them_alone_and_no_field(trained, monkeypat
         assert torch.equal(optimiser.state()[name], tensor), name
 
 
+def test_poses_are_fitted_for_no_more_steps_than_the_field_was_trained(trained, monkeypatch):
+    optimiser, _ = trained
+    monkeypatch.setattr(optimiser, "options", optimiser.options.model_copy(update={"steps": 3}))
+    steps, step = [], optimiser.poses.step
+    monkeypatch.setattr(optimiser.poses, "step", lambda *rate: (steps.append(rate), step(*rate)))
+    fit_held_out_poses(optimiser, [3])
+    assert len(steps) == 3
+
+
 def test_exposures_of_held_out_views_whose_poses_are_held_are_fitted_to_one_rendering(tmp_path, monkeypatch):
     dataset, images = tiny_set(tmp_path)
     options = tiny_options(exposure="on")
