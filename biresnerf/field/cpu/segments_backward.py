@@ -22,6 +22,9 @@ from biresnerf.field.numba_kernels import njit, prange
 
 f4 = np.float32
 ONE = f4(1)
+# Smaller gradients of a sample are no gradients: Adam would not feel them, and processors take many times as long for
+# products that are too small for a float's full precision, as those of empty space and of black become.
+FAINT = f4(1e-20)
 
 
 @njit(inline="always")
@@ -64,7 +67,8 @@ def _logit_gradients(begin, n, colour, gc, total, g_out):
     for c in range(3):
         for t in range(n):
             v = load(colour, c * total + begin + t)
-            store(g_out, c * STRIDE + t, load(gc, c * total + begin + t) * v * (ONE - v))
+            g = load(gc, c * total + begin + t) * v * (ONE - v)
+            store(g_out, c * STRIDE + t, g if abs(g) > FAINT else f4(0))
     zero_rest(g_out, 3, n)
 
 
@@ -74,7 +78,9 @@ def _add_density_gradient(begin, n, kept, outputs, density, gd, g):
     for t in range(n):
         i = kept[begin + t]
         if outputs[i] - DENSITY_SHIFT < DENSITY_CAP:
-            g[t] += gd[begin + t] * density[i]
+            through = gd[begin + t] * density[i]
+            if abs(through) > FAINT:
+                g[t] += through
 
 
 @njit(**KERNEL)

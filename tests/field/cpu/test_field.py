@@ -225,3 +225,19 @@ def test_rays_that_are_not_finite_break_nothing_and_leave_the_others_as_they_are
     found.colour.sum().backward()
     field.step(FieldRates(1e-2, 1e-2, (1e-2,) * 5, 1e-2))
     assert torch.isfinite(hostile.origin.grad[40:]).all()
+
+
+@pytest.mark.parametrize("layer", [1, 4], ids=["empty", "black"])
+def test_gradients_of_nearly_nothing_are_zero_and_never_too_small_for_quick_products(layer):
+    """Of space with next to no density, and of colours that are next to black."""
+    field = _pair(False, True)[1]
+    with torch.no_grad():
+        logits = field.networks[layer][: 1 if layer == 1 else 3]
+        logits.copy_(-1000 * logits.abs())
+    rays = _rays(130, 130, False)
+    _rendered(field, rays, None)
+    found = [rays.origin.grad, *_network_gradients(field), torch.from_numpy(field._pending[1])]
+    for gradient in found:
+        size = gradient.abs()
+        assert not ((size > 0) & (size < torch.finfo(torch.float32).tiny)).any()
+    assert any(bool(gradient.any()) for gradient in found) == (layer == 4)  # black has a density to learn
