@@ -26,7 +26,7 @@ from tests.refinement.tiny_scene import CPU, tiny_recipe, tiny_set, true_matches
 
 pytestmark = pytest.mark.slow
 
-VIEWS = 9
+VIEWS, MOVING = 9, 100
 
 
 @pytest.fixture(scope="module")
@@ -34,11 +34,13 @@ def scene(tmp_path_factory):
     return tiny_set(tmp_path_factory.mktemp("scene"), views=VIEWS, size=24)
 
 
-@pytest.fixture(autouse=True)
-def short(monkeypatch):
-    monkeypatch.setattr(start_module, "TRIAL_STEPS", 60)
-    monkeypatch.setattr(start_module, "MOVING_STEPS", 150)
-    monkeypatch.setattr(pose_trials, "SAMPLES", 8192)
+@pytest.fixture(scope="module", autouse=True)
+def short():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(start_module, "TRIAL_STEPS", 40)
+        patch.setattr(start_module, "MOVING_STEPS", MOVING)
+        patch.setattr(pose_trials, "SAMPLES", 8192)
+        yield
 
 
 def candidates(dataset, first: np.ndarray, second: np.ndarray) -> list[InitialPoses]:
@@ -52,10 +54,16 @@ def choose(images, tried: list[InitialPoses]) -> InitialPoses:
     return choose_start(tried, images, [0.0] * len(tried), tiny_recipe(), lambda: False)
 
 
-def test_good_matches_win_over_noisy_given_poses(scene):
+@pytest.fixture(scope="module")
+def chosen(scene, short) -> InitialPoses:
+    """Of noisy given poses, and of true ones that matches found."""
     dataset, images = scene
     noisy = perturb_poses(dataset.world_from_cam, 0.15, seed=1)
-    chosen = choose(images, candidates(dataset, noisy, dataset.world_from_cam))
+    return choose(images, candidates(dataset, noisy, dataset.world_from_cam))
+
+
+def test_good_matches_win_over_noisy_given_poses(scene, chosen):
+    dataset, _ = scene
     assert chosen.source == "matches-incremental"
     np.testing.assert_array_equal(chosen.world_from_cam, dataset.world_from_cam)
     assert chosen.trials[1].psnr > chosen.trials[0].psnr + 1
@@ -63,17 +71,17 @@ def test_good_matches_win_over_noisy_given_poses(scene):
 
 
 def test_trials_end_once_one_is_clearly_better(scene, monkeypatch):
-    monkeypatch.setattr(start_module, "TRIAL_STEPS", 240)
+    monkeypatch.setattr(start_module, "TRIAL_STEPS", 120)
     dataset, images = scene
     truth, works = dataset.world_from_cam, []
     for other in (perturb_poses(truth, 0.3, seed=1), truth):
         tried = candidates(dataset, other, truth)
         choose_start(tried, images, [0.0, 0.0], tiny_recipe(), lambda: False, works.append)
-    assert works == [2 * 240 / 4, 2 * (240 + 150)]
+    assert works == [2 * 120 / 4, 2 * (120 + MOVING)]
 
 
 def test_trials_end_once_photos_prefer_poses_that_alone_explain_the_matches(scene, monkeypatch):
-    monkeypatch.setattr(start_module, "TRIAL_STEPS", 240)
+    monkeypatch.setattr(start_module, "TRIAL_STEPS", 120)
     monkeypatch.setattr(start_module, "CLEAR_DB", 50.0)
     dataset, images = scene
     truth, tracks = dataset.world_from_cam, true_matches(dataset, noise_px=0.01)
@@ -88,10 +96,10 @@ def test_trials_end_once_photos_prefer_poses_that_alone_explain_the_matches(scen
     assert chosen(noisy, truth) == "matches-incremental"
     assert chosen(truth, noisy) == "given"
     assert chosen(truth, truth.copy()) == "given"  # both explain them, and no training tells them apart
-    assert works == [2 * 240 / 4] * 3
+    assert works == [2 * 120 / 4] * 3
     wrong = perturb_poses(truth, 0.3, seed=2)
     chosen(noisy, wrong)  # neither explains them
-    assert works[-1] == 2 * (240 + 150)
+    assert works[-1] == 2 * (120 + MOVING)
 
 
 def test_right_poses_explain_matches_and_wrong_or_unmatched_ones_do_not(scene):
@@ -244,10 +252,7 @@ def test_a_stop_ends_the_trial(scene):
         choose_start(tried, images, [0.0, 0.0], tiny_recipe(), lambda: True)
 
 
-def test_a_start_survives_its_checkpoint(scene):
-    dataset, images = scene
-    noisy = perturb_poses(dataset.world_from_cam, 0.15, seed=1)
-    chosen = choose(images, candidates(dataset, noisy, dataset.world_from_cam))
+def test_a_start_survives_its_checkpoint(chosen):
     start = TypeAdapter(InitialPoses)
     back = start.validate_python(json.loads(json.dumps(start.dump_python(chosen))))
     np.testing.assert_array_equal(back.world_from_cam, chosen.world_from_cam)
