@@ -115,7 +115,7 @@ def _refine(input: str | Path | Dataset, setup: _Setup, observer: Observer | Non
         stages.observer.at_end(stages)
         pictures = ResultPictures(setup.folder, scene)
         evaluation = evaluate(stages, pictures)
-        judgement = judge(stages)
+        judgement = judge(stages, finish)
         if judgement is not None:
             shown = pictures.write_before_after(evaluation.views, judgement.renders)
             evaluation = replace(evaluation, views=shown)

@@ -8,10 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.geometry.rigid_bodies import RigidBodies
+from biresnerf.geometry.similarity import Similarity
 from biresnerf.refinement.adjustment.adjustment import Adjustment
 from biresnerf.refinement.adjustment.choice import Candidate
 from biresnerf.refinement.adjustment.evidence import Evidence
 from biresnerf.refinement.finish.candidates import ORDER, usable
+from biresnerf.refinement.finish.expected_errors import ExpectedErrors, expected_errors
 from biresnerf.refinement.finish.given_poses import GivenPoses
 from biresnerf.report import CandidateName, CandidateReport
 
@@ -25,6 +28,14 @@ class Fit:
     world_from_cam: Array
     evidence: Evidence
     patch_noise: float
+
+    def errors_of(
+        self, world_from_cam: Array, world_from_unit: Similarity, bodies: RigidBodies
+    ) -> ExpectedErrors:
+        """What the evidence says of the errors of poses [n, 4, 4] in the input's frame, in that frame."""
+        in_unit = world_from_unit.inverse().apply_to_poses(world_from_cam)
+        found = expected_errors(in_unit, self.world_from_cam, self.evidence, self.patch_noise, bodies)
+        return found.carried(world_from_unit)
 
 
 @dataclass(frozen=True, eq=False)

@@ -47,6 +47,10 @@ class RefinedPoses:
         """Those of an earlier moment: poses [n, 4, 4] in the unit frame, and increments of the lenses."""
         return cls._of(dataset, optimiser, unit_from_cam, optimiser.lenses.at(increments))
 
+    def input_from_unit(self, optimiser: JointOptimiser) -> Similarity:
+        """From the unit frame that the optimisation is in."""
+        return self.input_from_optimised @ optimiser.frame.unit_from_world.inverse()
+
     @classmethod
     def _of(
         cls, dataset: Dataset, optimiser: JointOptimiser, unit_from_cam: Array, lenses: IntrinsicsParameters

@@ -17,7 +17,9 @@ from biresnerf.geometry.focus import focus_point, rms_spread
 from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.refinement.adjustment.cameras import Cameras
 from biresnerf.refinement.adjustment.measured_terms import control_believed, measured_misfits
+from biresnerf.refinement.finish.expected_errors import ExpectedErrors
 from biresnerf.refinement.finish.gather_evidence import measured_evidence
+from biresnerf.refinement.finish.outcome import Finish
 from biresnerf.refinement.lost.own_matches import contradicted
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.scene.scene import Scene
@@ -34,11 +36,13 @@ from biresnerf.refinement.verdict.verdict import (
     frame_doubt,
 )
 from biresnerf.refinement.views.compare_rigs import (
+    LONGER,
     BeforeAfter,
     Effort,
     HeldOutComparison,
     Rig,
     compare_placed,
+    may_be_blur,
 )
 from biresnerf.refinement.views.held_out_views import ROUNDS_MOST
 from biresnerf.refinement.views.motion import moved_px
@@ -61,6 +65,7 @@ class Judgement:
         renders: of some held-out views, in the verdict's training on the input's poses and on the refined ones.
         sharpness, gain: see `image_flags`.
         contradicted, moved_far, blurred, exposure_off: bool.
+        errors: what the evidence says of those of the refined poses; None where it says nothing.
     """
 
     verdict: Verdict
@@ -73,10 +78,14 @@ class Judgement:
     moved_far: NDArray[np.bool_]
     blurred: NDArray[np.bool_]
     exposure_off: NDArray[np.bool_]
+    errors: ExpectedErrors | None = None
 
 
-def judge(stages: TwoStages) -> Judgement | None:
+def judge(stages: TwoStages, finish: Finish) -> Judgement | None:
     """The verdict on the refined poses; None where the options ask for none.
+
+    Args:
+        finish: with the poses that fit all evidence that is to be trusted.
 
     Raises:
         Interrupted: stopped; a continued run judges again.
@@ -88,7 +97,7 @@ def judge(stages: TwoStages) -> Judgement | None:
         judgement = judge_poses(
             stages.scene, stages.optimiser, stages.monitor.should_stop,
             lambda share: stages.report_evaluation(share, message=message), _rounds(stages),
-            lambda work: stages.forecast.took(JUDGING + work),
+            lambda work: stages.forecast.took(JUDGING + work), finish,
         )  # fmt: skip
     logger.info("verdict: %s", judgement.verdict.verdict)
     return judgement
@@ -108,6 +117,7 @@ def judge_poses(
     report: Callable[[float], None] = lambda _share: None,
     rounds_most: int = ROUNDS_MOST,
     took: Callable[[float], None] = lambda _work: None,
+    finish: Finish = Finish(),
 ) -> Judgement:
     """Compare the optimised poses with the dataset's own; `report` is called with the share of work done.
 
@@ -120,19 +130,33 @@ def judge_poses(
     refined = RefinedPoses.now(scene.dataset, optimiser)
     lost = int(optimiser.camera_errors.lost.sum())
     found = compare_without_training(scene, refined, lost)
+    errors = _errors(refined, optimiser, finish)
+    told = replace(found.findings, determined=None if errors is None else float(errors.known.mean()))
     heldout: HeldOutComparison | None = None
-    if found.findings.moved_px >= MEASURABLE_PX:
+    work = 0.0
+    if told.moved_px >= MEASURABLE_PX:
         effort = Effort(
-            rounds_most=rounds_most, pictured=True, favoured=found.findings.favoured_by_matches,
-            moved_px=found.findings.moved_px,
-        )  # fmt: skip
-        heldout = compare_placed(
-            found.before, found.after, scene, optimiser, found.placed | (not found.findings.grounded),
-            should_stop, report, effort,
-        )  # fmt: skip
-    took(heldout.work if heldout else 0.0)
-    verdict = decide(replace(found.findings, heldout=heldout.evidence if heldout else None))
-    return _with_images(verdict, scene, optimiser, found, heldout)
+            rounds_most=rounds_most, pictured=True, favoured=told.favoured_by_matches, moved_px=told.moved_px
+        )
+        for each in (effort, replace(effort, times=LONGER, looks=(1.0,))):
+            heldout = compare_placed(
+                found.before, found.after, scene, optimiser, found.placed | (not told.grounded), should_stop,
+                report, each,
+            )  # fmt: skip
+            work += heldout.work if heldout else 0.0
+            if heldout is None or not may_be_blur(heldout.evidence, effort):
+                break
+    took(work)
+    verdict = decide(replace(told, heldout=heldout.evidence if heldout else None))
+    return replace(_with_images(verdict, scene, optimiser, found, heldout), errors=errors)
+
+
+def _errors(refined: RefinedPoses, optimiser: JointOptimiser, finish: Finish) -> ExpectedErrors | None:
+    """What the evidence says of the errors of refined poses; None where the method or the evidence says nothing."""
+    poses = refined.world_from_cam
+    if finish.fit is None or not (optimiser.method.uncertainty and np.isfinite(poses).all()):
+        return None
+    return finish.fit.errors_of(poses, refined.input_from_unit(optimiser), optimiser.bodies)
 
 
 @dataclass(frozen=True, eq=False)

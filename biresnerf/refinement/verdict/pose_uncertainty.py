@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from biresnerf.geometry.focus import focus_point, rms_spread
-from biresnerf.refinement.finish.expected_errors import ExpectedErrors, expected_errors
+from biresnerf.refinement.finish.expected_errors import ExpectedErrors
 from biresnerf.refinement.finish.outcome import Finish
 from biresnerf.refinement.lost.own_matches import contradicted
 from biresnerf.refinement.stages.two_stages import TwoStages
@@ -33,19 +33,13 @@ def pose_uncertainty(
     if not optimiser.method.uncertainty:
         return ()
     refined = RefinedPoses.now(dataset, optimiser)
-    poses, input_from_optimised = refined.world_from_cam, refined.input_from_optimised
+    poses, found = refined.world_from_cam, None if judgement is None else judgement.errors
     errors_px = np.full((2, len(dataset)), np.nan) if judgement is None else judgement.epipolar_px
     wrong = contradicted(errors_px[1])
     if judgement is not None and judgement.verdict.returned == "input":
-        poses, wrong = dataset.world_from_cam, contradicted(errors_px[0])
-    found: ExpectedErrors | None = None
-    if finish.fit is not None and np.isfinite(poses).all():
-        input_from_unit = input_from_optimised @ optimiser.frame.unit_from_world.inverse()
-        in_unit, fit = input_from_unit.inverse().apply_to_poses(poses), finish.fit
-        in_unit_errors = expected_errors(
-            in_unit, fit.world_from_cam, fit.evidence, fit.patch_noise, optimiser.bodies
-        )
-        found = in_unit_errors.carried(input_from_unit)
+        poses, found, wrong = dataset.world_from_cam, None, contradicted(errors_px[0])
+    if found is None and finish.fit is not None and np.isfinite(poses).all():
+        found = finish.fit.errors_of(poses, refined.input_from_unit(optimiser), optimiser.bodies)
     lost = optimiser.camera_errors.lost.tolist()
     reasons = [
         FIXED if optimiser.bodies.fixed[i]

@@ -44,6 +44,7 @@ class Findings:
         grounded: whether the input's poses are given ones or come from matches, and are not mere guesses.
         offset: whether an offset that all given poses shared was taken back.
         by_gimbal: whether most of the input's poses are those of GPS and a gimbal.
+        determined: the share of cameras whose refined poses feature matches and photos determine; None if not known.
         favoured_by_positions: 1 where measured places fit the refined poses better beyond chance, -1 the input's, 0
             where neither, and their accuracy is stated; else None.
     """
@@ -61,6 +62,7 @@ class Findings:
     offset: bool = False
     favoured_by_positions: Literal[-1, 0, 1] | None = None
     by_gimbal: bool = False
+    determined: float | None = None
 
     @property
     def explained(self) -> bool:
@@ -76,7 +78,12 @@ class Findings:
         """The poses that feature matches speak for: 1 the refined ones, -1 the input's, 0 neither."""
         if self.epipolar is not None and self.epipolar.error_px.finding == "worse":
             return -1
-        return 1 if _matches_are_better(self) and self.explained else 0
+        return 1 if _matches_are_better(self) and self.explained and not self.undetermined else 0
+
+    @property
+    def undetermined(self) -> bool:
+        """Whether the evidence leaves most refined poses open: it may fit wrong ones as well."""
+        return self.determined is not None and self.determined < MOSTLY
 
 
 def failed_checks(refined: Array, lost: int) -> tuple[str, ...]:
@@ -158,6 +165,11 @@ def _judge(f: Findings) -> tuple[VerdictName, str]:
 
 def _without_a_voice(f: Findings) -> tuple[VerdictName, str]:
     """Where nothing may speak, for or against."""
+    if _matches_are_better(f) and f.undetermined:
+        return (
+            "inconclusive",
+            "Feature matches fit the refined poses better, but do not determine the poses of most photos.",
+        )
     if _matches_are_better(f):
         return (
             "inconclusive",
@@ -208,7 +220,7 @@ def _counted(f: Findings) -> list[PairedDifference]:
 def _for(f: Findings) -> list[str]:
     """What speaks for the refined poses."""
     names = []
-    if _views_are_better(f) and (_views_tell(f) or _matches_are_better(f)):
+    if _views_are_better(f) and (_views_tell(f) or (_matches_are_better(f) and not f.undetermined)):
         names.append(VIEWS)
     if f.favoured_by_matches > 0:
         names.append(MATCHES)

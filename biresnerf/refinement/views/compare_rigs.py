@@ -30,6 +30,8 @@ PSNR_MATTERS, SSIM_MATTERS = 0.5, 0.01  # dB, and 1
 # Poses that photos miss by less than half of a motion are nearer to the truth than those before it: the triangle's
 # inequality. Short trainings blur, and so miss by up to so much at true poses (px at working size, docs/verdict.md).
 NEARER, BLUR_PX = 0.5, 2.0
+# A gain of views that are missed by more than half of the motion must stand in trainings so many times as long.
+LONGER = 4
 # Before the end of a training chance is larger, as its rates have not fallen yet: 0.3 dB.
 EARLY = 2  # times what matters
 
@@ -168,6 +170,13 @@ def _missed_px(scores: TrialScores, images: ImageSet, views: Sequence[int]) -> f
 def photos_tell(missed_px: float, moved_px: float) -> bool:
     """Whether renders with the better poses are near enough to the photos to tell others that differ by a motion."""
     return missed_px <= max(BLUR_PX, NEARER * moved_px)
+
+
+def may_be_blur(evidence: HeldOutEvidence, effort: Effort) -> bool:
+    """Whether a gain may be that of poses which a short training's blur suits, and nothing else speaks for them."""
+    if effort.favoured > 0 or evidence.psnr.finding != "better" or evidence.missed_px is None:
+        return False
+    return NEARER * effort.moved_px < evidence.missed_px <= BLUR_PX
 
 
 def _evidence(

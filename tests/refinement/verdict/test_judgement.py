@@ -75,6 +75,20 @@ def test_true_poses_miss_the_photos_by_less_than_wrong_ones(scene):
     assert judged(scene, truth, noisy).verdict.heldout.missed_px < compare_rigs.BLUR_PX
 
 
+def test_a_gain_that_may_be_blurs_must_stand_in_longer_trainings_unless_matches_speak(
+    scene, noisy, monkeypatch
+):
+    truth, steps = scene[0].world_from_cam, OPTIONS.trial_steps
+    alone, matched = (
+        judged(scene, noisy, truth, tracks).verdict for tracks in (None, true_matches(scene[0]))
+    )
+    assert (alone.verdict, alone.heldout.steps) == ("improved", compare_rigs.LONGER * steps)
+    assert compare_rigs.NEARER * matched.moved_px < matched.heldout.missed_px < compare_rigs.BLUR_PX
+    assert (matched.verdict, matched.heldout.steps <= steps) == ("improved", True)
+    monkeypatch.setattr(compare_rigs, "BLUR_PX", 0.1)  # poses that miss by more are not what blur suits
+    assert judged(scene, noisy, truth).verdict.heldout.steps <= steps
+
+
 def test_other_views_are_left_out_only_until_they_decide(scene):
     truth = scene[0].world_from_cam
     first, second = unseen_rounds(VIEWS, [3])

@@ -81,3 +81,34 @@ def test_a_pose_that_its_own_matches_contradict_is_not_known(tmp_path, rng):
     assert [each.why_unknown for each in known] == [
         MATCHES_CONTRADICT if i == 3 else None for i in range(VIEWS)
     ]
+
+
+def test_matches_speak_for_poses_only_where_they_determine_most_of_them(tmp_path, rng, monkeypatch):
+    monkeypatch.setattr(f"{judge_poses.__module__}.compare_placed", lambda *_, **__: None)
+    run, _ = noisy_run(tmp_path, rng)
+    finish = adjust_cameras(run)
+    evidence = finish.fit.evidence
+    of_few = replace(evidence, tracks=evidence.tracks.where(evidence.tracks.image < VIEWS // 3))
+    open_ = replace(finish, fit=replace(finish.fit, evidence=of_few))
+    told, untold = (judge_poses(run.scene, run.optimiser, finish=each) for each in (finish, open_))
+    assert (told.verdict.verdict, told.verdict.returned) == ("improved", "refined")
+    assert 0 < untold.errors.known.sum() < VIEWS / 2
+    assert (untold.verdict.verdict, untold.verdict.returned) == ("inconclusive", "input")
+    assert "do not determine the poses of most photos" in untold.verdict.why[0]
+
+
+def test_what_the_verdict_found_of_the_errors_is_what_the_report_has(tmp_path, rng):
+    run, _ = noisy_run(tmp_path, rng)
+    finish = adjust_cameras(run)
+    judgement = judge_poses(run.scene, run.optimiser, finish=finish)
+    assert judgement.verdict.returned == "refined"
+    assert judgement.errors is not None
+    assert pose_uncertainty(run, finish, judgement) == pose_uncertainty(
+        run, finish, replace(judgement, errors=None)
+    )
+    # Where the input's poses come back, the evidence says that these are far off, or nothing.
+    kept = replace(judgement, verdict=judgement.verdict.model_copy(update={"returned": "input"}))
+    refined, given = (
+        [each.rotation_deg for each in pose_uncertainty(run, finish, of)] for of in (judgement, kept)
+    )
+    assert all(each is None or each > 2 * max(refined) for each in given)

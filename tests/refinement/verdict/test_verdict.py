@@ -151,6 +151,19 @@ def test_photos_alone_do_not_speak_for_poses_that_miss_them_by_more_than_half_of
     assert decide(findings(held_out(-0.7, missed_px=6.0), moved_px=2.2)).verdict == "kept_input"
 
 
+def test_matches_that_leave_most_poses_open_speak_for_none():
+    matches = findings(held_out(0.05), matched(1.0), determined=0.4)
+    blurred = replace(matches, heldout=held_out(0.7, missed_px=6.0))
+    assert [decide(each).verdict for each in (matches, blurred)] == ["inconclusive", "inconclusive"]
+    for share in (0.5, None):
+        assert decide(replace(matches, determined=share)).verdict == "improved"
+        assert decide(replace(blurred, determined=share, moved_px=11.5)).verdict == "improved"
+    # Photos that are near their renders need no matches, and found poses yield as before.
+    assert decide(replace(matches, heldout=held_out(4.0))).verdict == "improved"
+    assert decide(replace(matches, compared_with="seeded")).returned == "refined"
+    assert decide(replace(matches, epipolar=matched(-1.0))).verdict == "kept_input"
+
+
 def test_poses_that_nobody_gave_yield_to_refined_ones_that_measure_the_same():
     """As those with a principal point that was found: all cameras turn, which neither photos nor matches can tell."""
     same = findings(held_out(0.1, spread=0.05), matched(0.0))
