@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Self
 
@@ -104,6 +105,7 @@ def _stamp(field: bool) -> Path:
     return Path(config.CACHE_DIR or cache_folder() / "kernels", f"compiled-{key}")  # type: ignore[attr-defined]
 
 
+@cache  # a process that has done it has them
 def compile_field_kernels(*, backward: bool = True) -> None:
     """Every kernel once on a tiny field, on the way a step takes; or only what renders."""
     shape = FieldShape(grid_levels(2, 4, 8, 10), grid_levels(2, 16, 32, 10), unbounded=False)
@@ -123,6 +125,7 @@ def compile_field_kernels(*, backward: bool = True) -> None:
         field.step(FieldRates(1e-3, 1e-3, (1e-3,) * 2, 1e-3))
 
 
+@cache
 def _cast_one_ray() -> None:
     """One pixel of one photo, on the way a step takes."""
     cpu = torch.device("cpu")
@@ -140,6 +143,7 @@ def _cast_one_ray() -> None:
     direction.sum().backward()
 
 
+@cache
 def _adjust_two_cameras() -> None:
     """Two cameras side by side look at a wall of vertical waves, on which points are tracked."""
     poses = np.tile(np.eye(4), (2, 1, 1))

@@ -32,7 +32,7 @@ pytestmark = pytest.mark.slow
 OPTIONS = RefineOptions(
     preset="fast", device="cpu", start="given", steps=400, max_image_size=32, samples_per_step=4096,
     pose_resolution_max=24, reconstruction_levels=2, reconstruction_resolution_max=256, table_size_log2=12,
-    orbit_frames=0, checkpoint_every_s=1,
+    trial_steps=0, orbit_frames=0, checkpoint_every_s=1,
 )  # fmt: skip
 
 

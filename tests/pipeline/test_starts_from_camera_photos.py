@@ -19,7 +19,7 @@ from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import PoseError, pose_error
 from biresnerf.pipeline import refine_poses
-from biresnerf.refinement.start import turntable
+from biresnerf.refinement.start import choose_start, turntable
 from biresnerf.report import Report
 from tests.data.scenes import plain_features, textured_arc
 from tests.refinement.tiny_scene import tiny_run
@@ -62,7 +62,9 @@ def refined(folder: Path, truth: np.ndarray, start: str, **options) -> tuple[Rep
 
 
 @needs_colmap
-def test_auto_brings_the_poses_of_a_phone_near_the_truth(tmp_path):
+def test_auto_brings_the_poses_of_a_phone_near_the_truth(tmp_path, monkeypatch):
+    monkeypatch.setattr(choose_start, "TRIAL_STEPS", 80)
+    monkeypatch.setattr(choose_start, "MOVING_STEPS", 120)
     truth = photos(tmp_path / "set", "android", noise=0.1)
     report, error = refined(tmp_path, truth, "auto")
     assert {image.pose_source for image in report.images} == {"matches-incremental"}

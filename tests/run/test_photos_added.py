@@ -12,6 +12,7 @@ import biresnerf
 from biresnerf.errors import InputError
 from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.geometry.similarity import align_by_spread
+from biresnerf.refinement.start import choose_start
 from tests.data.scenes import plain_features, textured_arc
 
 pytestmark = pytest.mark.slow
@@ -23,6 +24,15 @@ OPTIONS = {
     "verdict": False,
     "pose_resolution_max": 16, "reconstruction_levels": 1, "reconstruction_resolution_max": 128, "table_size_log2": 10,
 }  # fmt: skip
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_trials():
+    """Trials of the start are long enough for photos of so few pixels."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(choose_start, "TRIAL_STEPS", 40)
+        patch.setattr(choose_start, "MOVING_STEPS", 80)
+        yield
 
 
 @pytest.fixture(scope="module")

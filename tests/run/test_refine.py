@@ -17,7 +17,7 @@ from biresnerf.data.synthetic.scene import write_synthetic_scene
 from tests.commands.poses.test_refine import SETTINGS
 
 pytestmark = pytest.mark.slow
-OPTIONS = {**SETTINGS, "steps": 40, "start": "none", "trial_steps": 0, "shown_views": 0}
+OPTIONS = {**SETTINGS, "steps": 40, "start": "none", "shown_views": 0}
 
 
 @pytest.fixture(scope="module")

@@ -33,6 +33,7 @@ SETTINGS = {
     "reconstruction_resolution_max": 128,
     "table_size_log2": 10,
     "holdout": 0,
+    "trial_steps": 0,
     "orbit_frames": 0,
     "checkpoint_every_s": 1,
 }

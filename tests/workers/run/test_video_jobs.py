@@ -18,7 +18,7 @@ pytestmark = [pytest.mark.server, pytest.mark.slow]
 
 SMALL = {
     "preset": "fast", "steps": 20, "max_image_size": 32, "samples_per_step": 2048, "reconstruction_levels": 2,
-    "table_size_log2": 12, "orbit_frames": 2, "start": "none", "verdict": False, "threads": 1, "video_frames": 5,
+    "table_size_log2": 12, "orbit_frames": 2, "verdict": False, "threads": 1, "video_frames": 5,
 }  # fmt: skip
 
 

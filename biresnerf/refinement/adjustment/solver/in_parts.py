@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from itertools import pairwise
 from typing import TypeVar
 
@@ -17,5 +18,10 @@ def in_parts(kernel: Callable[[slice], Result], items: int) -> list[Result]:
     """What a kernel that releases Python's lock makes of as many equal parts of the items, in order."""
     workers = numba.get_num_threads()
     bounds = np.linspace(0, items, workers + 1).astype(int)
-    with ThreadPoolExecutor(workers) as threads:
-        return list(threads.map(kernel, (slice(*ends) for ends in pairwise(bounds))))
+    parts = (slice(*ends) for ends in pairwise(bounds))
+    return list(map(kernel, parts) if workers == 1 else _threads(workers).map(kernel, parts))
+
+
+@cache  # to begin threads takes longer than a part of a small set
+def _threads(workers: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(workers)
