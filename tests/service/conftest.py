@@ -69,15 +69,13 @@ def short_folder() -> Iterator[Path]:
 def running_service(folder: Path, **settings: Any) -> Iterator[Running]:
     """`biresnerf up` on a free port; ended by SIGINT, as Ctrl-C does."""
     values = {
-        "beat_s": 0.5,
+        # Quick enough to be waited for; several services stand by while other tests want the processor.
+        **{"beat_s": 1.0, "poll_s": 1.0, "janitor_s": 1.0, "expiry_s": 1.0},
         "stall_s": 10.0,  # a worker that gets no processor for seconds is not dead
-        "poll_s": 0.3,
-        "janitor_s": 0.5,
         "data_dir": folder / "data",
         "job_nice": 0,  # tests wait for jobs, whatever else the machine does
         "log_level": "INFO",
         # Receivers of webhooks and senders of files live on this machine.
-        "expiry_s": 0.5,
         "webhook_http": True,
         "webhook_ports": (),
         "webhook_networks": ("127.0.0.0/8",),
