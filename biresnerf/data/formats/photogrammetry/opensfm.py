@@ -136,6 +136,13 @@ def world_from_cam_of_vector(rotation: _Vector, translation: _Vector, where: str
     """
     vector = np.array(rotation)
     half = float(np.linalg.norm(vector)) / 2.0
+    if half > math.pi * (1 + 1e-6):
+        raise InputError(
+            "pose_out_of_range",
+            f"the rotation is {2 * half:.3g} long, and a whole turn is 6.28: it looks like degrees.",
+            where=where,
+            hint="Give the axis times the angle in radians, as OpenSfM does: multiply degrees by pi / 180.",
+        )
     quat_wxyz = (math.cos(half), *(vector * (0.5 * float(np.sinc(half / math.pi)))).tolist())
     return rigid_inverse(matrix_of_pose(rigid_pose((*quat_wxyz, *translation), where, _HINT)))
 

@@ -119,6 +119,21 @@ def test_one_bad_shot_costs_one_image_its_pose(tmp_path, change, code, where):
     assert_complete(caught.value, code, "reconstruction.json", where)
 
 
+def test_degrees_in_place_of_radians_are_refused_by_name(tmp_path):
+    refined = made("PINHOLE")
+    write_photos(tmp_path, refined)
+    write_opensfm(refined, tmp_path / "reconstruction.json")
+
+    def in_degrees(document):
+        for shot in document[0]["shots"].values():
+            shot["rotation"] = np.degrees(shot["rotation"]).tolist()
+
+    rewrite(tmp_path / "reconstruction.json", in_degrees)
+    with pytest.raises(InputError, match="it looks like degrees") as caught:
+        read_dataset(tmp_path)
+    assert_complete(caught.value, "pose_out_of_range", "reconstruction.json")
+
+
 @pytest.mark.parametrize(
     ("change", "code"),
     [
