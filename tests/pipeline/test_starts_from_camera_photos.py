@@ -95,6 +95,7 @@ def test_without_features_photos_of_a_phone_held_both_ways_are_put_between_their
 
 def test_a_turning_scene_before_a_reflex_camera_is_put_on_a_ring(tmp_path, monkeypatch):
     monkeypatch.setattr(turntable, "ELEVATIONS_DEG", (0.0, 30.0, 60.0))
+    monkeypatch.setattr(turntable, "TRY_STEPS", 75)
     truth = turntable_cameras(24, uneven=0.2, seed=1)
     pictures = (render_synthetic(pose, 32, 3)[0] for pose in truth)
     write_blender_set(tmp_path / "set", truth, pictures, "dome", MAKERS["reflex"])

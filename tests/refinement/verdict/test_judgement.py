@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from biresnerf.data import workload
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.images import ImageSet, load_images
 from biresnerf.data.points.tracks import Tracks
@@ -34,6 +35,12 @@ pytestmark = pytest.mark.slow
 
 VIEWS = 14
 OPTIONS = tiny_options(trial_steps=60, samples_per_step=8192)
+
+
+@pytest.fixture(autouse=True)
+def few_pictures(monkeypatch):
+    """Trainings end when they have decided; else they would go on until their fields are worth a look."""
+    monkeypatch.setattr(workload, "PICTURE_STEPS", 10)
 
 
 @pytest.fixture(scope="module")
@@ -98,9 +105,10 @@ def test_other_views_are_left_out_only_until_they_decide(scene):
     assert far.heldout.psnr.low > 0.5
 
 
-def test_trainings_end_once_they_decide_but_for_pictures(scene):
+def test_trainings_end_once_they_decide_but_for_pictures(scene, monkeypatch):
     dataset, images = scene
-    truth, steps, pictured = dataset.world_from_cam, 240, 200
+    truth, steps, pictured = dataset.world_from_cam, 200, 150
+    monkeypatch.setattr(workload, "PICTURE_STEPS", pictured)
     options = OPTIONS.model_copy(update={"trial_steps": steps})
     optimiser = tiny_optimiser(dataset, images, options, held_out=[3])
     for noise, decided, other_rounds in ((0.3, steps // 4, 0), (0.02, steps, steps)):
@@ -175,7 +183,8 @@ def test_lost_frames_fail_the_check(scene):
     assert judgement.verdict.returned == "input"
 
 
-def test_images_whose_poses_were_guessed_have_no_part_in_the_trials(scene, noisy):
+def test_images_whose_poses_were_guessed_have_no_part_in_the_trials(scene, noisy, monkeypatch):
+    monkeypatch.setattr(f"{judge_poses.__module__}.LONGER", 1)
     dataset, images = scene
     truth = dataset.world_from_cam
 
