@@ -23,28 +23,29 @@ SEED = int(os.environ.get("BIRESNERF_TEST_SEED") or random.randrange(2**32))
 PHASES = [Phase.generate]
 
 
+# Hypothesis leaves kinds of steps out of an example by chance, so ten may lack one: others follow.
+FAULTS, ENOUGH, ROUNDS_MOST = ("calls that lost a connection", "processes that died within a call"), 10, 10
+
+
 def test_no_interleaving_breaks_a_promise(database_url: str, tmp_path: Path):
     print(f"BIRESNERF_TEST_SEED={SEED}")  # noqa: T201
     with promises_on(database_url, tmp_path) as promises:
-        run_state_machine_as_test(
-            seed(SEED)(promises),
-            settings=settings(
-                max_examples=INTERLEAVINGS or 10,
-                stateful_step_count=50,
-                database=None,
-                deadline=None,
-                suppress_health_check=list(HealthCheck),
-                report_multiple_bugs=False,
-                phases=PHASES,
-            ),
-        )
         counts = promises.counts
+        for number in range(ROUNDS_MOST):
+            run_state_machine_as_test(
+                seed(SEED + number)(promises),
+                settings=settings(
+                    max_examples=INTERLEAVINGS or 10,
+                    stateful_step_count=50,
+                    database=None,
+                    deadline=None,
+                    suppress_health_check=list(HealthCheck),
+                    report_multiple_bugs=False,
+                    phases=PHASES,
+                ),
+            )
+            if min(counts.get(kind, 0) for kind in FAULTS) > ENOUGH:
+                break
     print(counts)  # noqa: T201
     assert counts["examples"] >= 10
-    assert (
-        min(
-            counts.get(kind, 0)
-            for kind in ("calls that lost a connection", "processes that died within a call")
-        )
-        > 10
-    )
+    assert min(counts.get(kind, 0) for kind in FAULTS) > ENOUGH
