@@ -131,7 +131,7 @@ def judge_poses(
     lost = int(optimiser.camera_errors.lost.sum())
     found = compare_without_training(scene, refined, lost)
     errors = _errors(refined, optimiser, finish)
-    told = replace(found.findings, determined=None if errors is None else float(errors.known.mean()))
+    told = replace(found.findings, determined=_determined(errors, finish))
     heldout: HeldOutComparison | None = None
     work = 0.0
     if told.moved_px >= MEASURABLE_PX:
@@ -149,6 +149,13 @@ def judge_poses(
     took(work)
     verdict = decide(replace(told, heldout=heldout.evidence if heldout else None))
     return replace(_with_images(verdict, scene, optimiser, found, heldout), errors=errors)
+
+
+def _determined(errors: ExpectedErrors | None, finish: Finish) -> float | None:
+    """The share of cameras that the evidence determines; none where photos, or its noise, spoke against all of it."""
+    if finish.fit is None and finish.candidates:
+        return 0.0
+    return None if errors is None else float(errors.known.mean())
 
 
 def _errors(refined: RefinedPoses, optimiser: JointOptimiser, finish: Finish) -> ExpectedErrors | None:

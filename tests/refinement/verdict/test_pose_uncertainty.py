@@ -90,11 +90,16 @@ def test_matches_speak_for_poses_only_where_they_determine_most_of_them(tmp_path
     evidence = finish.fit.evidence
     of_few = replace(evidence, tracks=evidence.tracks.where(evidence.tracks.image < VIEWS // 3))
     open_ = replace(finish, fit=replace(finish.fit, evidence=of_few))
-    told, untold = (judge_poses(run.scene, run.optimiser, finish=each) for each in (finish, open_))
+    told, untold, refused, never = (
+        judge_poses(run.scene, run.optimiser, finish=each)
+        for each in (finish, open_, finish.refused(), Finish())
+    )
     assert (told.verdict.verdict, told.verdict.returned) == ("improved", "refined")
     assert 0 < untold.errors.known.sum() < VIEWS / 2
     assert (untold.verdict.verdict, untold.verdict.returned) == ("inconclusive", "input")
     assert "do not determine the poses of most photos" in untold.verdict.why[0]
+    # Photos refused what matches prefer; or nobody adjusted to them, and nobody knows.
+    assert [each.verdict.returned for each in (refused, never)] == ["input", "refined"]
 
 
 def test_what_the_verdict_found_of_the_errors_is_what_the_report_has(tmp_path, rng):
