@@ -34,6 +34,7 @@ from biresnerf.refinement.verdict.verdict import (
     decide,
     failed_checks,
     frame_doubt,
+    matches_are_better,
 )
 from biresnerf.refinement.views.compare_rigs import (
     LONGER,
@@ -65,7 +66,7 @@ class Judgement:
         renders: of some held-out views, in the verdict's training on the input's poses and on the refined ones.
         sharpness, gain: see `image_flags`.
         contradicted, moved_far, blurred, exposure_off: bool.
-        errors: what the evidence says of those of the refined poses; None where it says nothing.
+        errors: what the evidence says of those of the refined poses; None where it says nothing, or nobody had to know.
     """
 
     verdict: Verdict
@@ -130,7 +131,8 @@ def judge_poses(
     refined = RefinedPoses.now(scene.dataset, optimiser)
     lost = int(optimiser.camera_errors.lost.sum())
     found = compare_without_training(scene, refined, lost)
-    errors = _errors(refined, optimiser, finish)
+    # Only then it matters what the evidence determines: to know it, a matrix of all cameras is inverted.
+    errors = _errors(refined, optimiser, finish) if matches_are_better(found.findings) else None
     told = replace(found.findings, determined=_determined(errors, finish))
     heldout: HeldOutComparison | None = None
     work = 0.0

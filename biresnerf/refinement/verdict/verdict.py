@@ -78,7 +78,7 @@ class Findings:
         """The poses that feature matches speak for: 1 the refined ones, -1 the input's, 0 neither."""
         if self.epipolar is not None and self.epipolar.error_px.finding == "worse":
             return -1
-        return 1 if _matches_are_better(self) and self.explained and not self.undetermined else 0
+        return 1 if matches_are_better(self) and self.explained and not self.undetermined else 0
 
     @property
     def undetermined(self) -> bool:
@@ -165,12 +165,12 @@ def _judge(f: Findings) -> tuple[VerdictName, str]:
 
 def _without_a_voice(f: Findings) -> tuple[VerdictName, str]:
     """Where nothing may speak, for or against."""
-    if _matches_are_better(f) and f.undetermined:
+    if matches_are_better(f) and f.undetermined:
         return (
             "inconclusive",
             "Feature matches fit the refined poses better, but do not determine the poses of most photos.",
         )
-    if _matches_are_better(f):
+    if matches_are_better(f):
         return (
             "inconclusive",
             "Feature matches fit the refined poses better, but by too little for poses that moved by "
@@ -206,7 +206,7 @@ def _found_poses_yield(f: Findings) -> bool:
         return False
     heeded = f.favoured_by_positions is not None and f.moved_px >= MEASURABLE_PX
     fits = f.epipolar is not None and f.epipolar.share_of_image <= FITS_BELOW
-    return heeded or (fits and _matches_are_better(f))
+    return heeded or (fits and matches_are_better(f))
 
 
 def _counted(f: Findings) -> list[PairedDifference]:
@@ -220,7 +220,7 @@ def _counted(f: Findings) -> list[PairedDifference]:
 def _for(f: Findings) -> list[str]:
     """What speaks for the refined poses."""
     names = []
-    if _views_are_better(f) and (_views_tell(f) or (_matches_are_better(f) and not f.undetermined)):
+    if _views_are_better(f) and (_views_tell(f) or (matches_are_better(f) and not f.undetermined)):
         names.append(VIEWS)
     if f.favoured_by_matches > 0:
         names.append(MATCHES)
@@ -239,7 +239,8 @@ def _views_tell(f: Findings) -> bool:
     return missed is None or photos_tell(missed, f.moved_px)
 
 
-def _matches_are_better(f: Findings) -> bool:
+def matches_are_better(f: Findings) -> bool:
+    """Whether independent matches fit the refined poses better, whatever that shows."""
     return f.epipolar is not None and f.epipolar.independent and f.epipolar.error_px.finding == "better"
 
 
