@@ -51,16 +51,30 @@ class SplitEvidence:
 
 
 def gather_evidence(scene: Scene, optimiser: JointOptimiser) -> SplitEvidence:
-    """Tracks and patches for ideal cameras, without cameras that are at a guess still.
+    """Tracks and patches for ideal cameras, without cameras that are at a guess still."""
+    split = without_patches(scene, optimiser)
+    intrinsics, ideal = _intrinsics(optimiser.lenses.refined(scene.dataset)), split.fitted.intrinsics
+    patches = photo_patches(scene, optimiser, intrinsics, ideal, split.placed)
+    if patches is None:
+        return split
+    spared = np.arange(len(patches)) % LEFT_OUT_ONE_IN == 0
+    return replace(
+        split,
+        fitted=replace(split.fitted, patches=patches.of(~spared)),
+        left_out=replace(split.left_out, patches=patches.of(spared)),
+    )
+
+
+def without_patches(scene: Scene, optimiser: JointOptimiser) -> SplitEvidence:
+    """Tracks for ideal cameras, and what was measured beside photos; without cameras that are at a guess still.
 
     Photos of another scene match each other, and could outweigh the scene's own.
     """
     placed = ~optimiser.camera_errors.doubted.cpu().numpy()
     dataset = optimiser.lenses.refined(scene.dataset)
-    intrinsics = Intrinsics.from_cameras([dataset.camera_of(i) for i in range(len(dataset))])
+    intrinsics = _intrinsics(dataset)
     ideal = ideal_cameras(intrinsics)
     before = lenses_before(scene.dataset, optimiser.options.refine_intrinsics)
-    lenses = before if before.free.any() else None
     fitted: Tracks | None = None
     judging: Tracks | None = None
     tracks = scene.tracks and scene.tracks.where(placed[scene.tracks.image])
@@ -70,18 +84,17 @@ def gather_evidence(scene: Scene, optimiser: JointOptimiser) -> SplitEvidence:
         tracks = tracks.thinned(MOST_IN_THE_END, len(dataset))
         fitted = fitted and fitted.thinned(MOST_OBSERVATIONS, len(dataset))
     measured = measured_evidence(dataset, optimiser.poses.poses().numpy(), placed)
-    patches = photo_patches(scene, optimiser, intrinsics, ideal, placed)
-    if patches is None:
-        return SplitEvidence(
-            replace(measured, tracks=fitted, lenses=lenses), Evidence(ideal, judging), tracks, placed
-        )
-    spared = np.arange(len(patches)) % LEFT_OUT_ONE_IN == 0
     return SplitEvidence(
-        replace(measured, tracks=fitted, patches=patches.of(~spared), lenses=lenses),
-        Evidence(ideal, judging, patches.of(spared)),
+        replace(measured, tracks=fitted, lenses=before if before.free.any() else None),
+        Evidence(ideal, judging),
         tracks,
         placed,
     )
+
+
+def _intrinsics(dataset: Dataset) -> Intrinsics:
+    """Of each image."""
+    return Intrinsics.from_cameras([dataset.camera_of(i) for i in range(len(dataset))])
 
 
 def measured_evidence(dataset: Dataset, poses: Array, placed: NDArray[np.bool_]) -> Evidence:
@@ -89,8 +102,7 @@ def measured_evidence(dataset: Dataset, poses: Array, placed: NDArray[np.bool_])
 
     Not positions that are far beyond the others, nor check points.
     """
-    lenses = [dataset.camera_of(i) for i in range(len(dataset))]
-    intrinsics = Intrinsics.from_cameras(lenses)
+    intrinsics = _intrinsics(dataset)
     evidence = Evidence(ideal_cameras(intrinsics))
     if not np.isfinite(poses).all():
         return evidence
@@ -103,7 +115,7 @@ def measured_evidence(dataset: Dataset, poses: Array, placed: NDArray[np.bool_])
     if dataset.control is not None:
         with suppress(NoGeoreference):
             points = dataset.control.of(placed)
-            located(points, poses, lenses)
+            located(points, poses, [dataset.camera_of(i) for i in range(len(dataset))])
             points = points.seen_in(~points.check[points.point])
             tracks = straight_tracks(
                 Tracks(points.point, points.image, points.xy), intrinsics, evidence.intrinsics

@@ -6,6 +6,7 @@ import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -97,18 +98,17 @@ def judge(stages: TwoStages, finish: Finish) -> Judgement | None:
     with stages.timed("judging"):
         judgement = judge_poses(
             stages.scene, stages.optimiser, stages.monitor.should_stop,
-            lambda share: stages.report_evaluation(share, message=message), _rounds(stages),
+            lambda share: stages.report_evaluation(share, message=message), partial(_rounds, stages),
             lambda work: stages.forecast.took(JUDGING + work), finish,
         )  # fmt: skip
     logger.info("verdict: %s", judgement.verdict.verdict)
     return judgement
 
 
-def _rounds(stages: TwoStages) -> int:
-    """How many rounds of trainings there is time for; one in any case."""
-    each_s = stages.forecast.seconds("judging")
-    in_time = (stages.ends - time.monotonic()) / max(each_s, 1e-9)
-    return int(min(max(in_time, 1), ROUNDS_MOST))
+def _rounds(stages: TwoStages, times: int) -> int:
+    """How many rounds of trainings of `times` the usual length there is time for."""
+    each_s = times * stages.forecast.seconds("judging")
+    return int(min(max((stages.ends - time.monotonic()) / max(each_s, 1e-9), 0), ROUNDS_MOST))
 
 
 def judge_poses(
@@ -116,13 +116,14 @@ def judge_poses(
     optimiser: JointOptimiser,
     should_stop: Callable[[], bool] = lambda: False,
     report: Callable[[float], None] = lambda _share: None,
-    rounds_most: int = ROUNDS_MOST,
+    rounds_in_time: Callable[[int], int] = lambda _times: ROUNDS_MOST,
     took: Callable[[float], None] = lambda _work: None,
     finish: Finish = Finish(),
 ) -> Judgement:
     """Compare the optimised poses with the dataset's own; `report` is called with the share of work done.
 
-    Fields are trained in ``rounds_most`` rounds at most. `took` is called with the work that it was.
+    `rounds_in_time` says in how many rounds fields may be trained, so many times as long as usual; they are trained in
+    one of the usual length in any case. `took` is called with the work that it was.
 
     Raises:
         Interrupted: ``should_stop`` returned true.
@@ -137,16 +138,18 @@ def judge_poses(
     heldout: HeldOutComparison | None = None
     work = 0.0
     if told.moved_px >= MEASURABLE_PX:
-        effort = Effort(
-            rounds_most=rounds_most, pictured=True, favoured=told.favoured_by_matches, moved_px=told.moved_px
-        )
+        effort = Effort(pictured=True, favoured=told.favoured_by_matches, moved_px=told.moved_px)
+        rounds = max(rounds_in_time(1), 1)
         for each in (effort, replace(effort, times=LONGER, looks=(1.0,))):
             heldout = compare_placed(
                 found.before, found.after, scene, optimiser, found.placed | (not told.grounded), should_stop,
-                report, each,
+                report, replace(each, rounds_most=rounds),
             )  # fmt: skip
             work += heldout.work if heldout else 0.0
-            if heldout is None or not may_be_blur(heldout.evidence, effort):
+            blur = each is effort and heldout is not None and may_be_blur(heldout.evidence, effort)
+            rounds = rounds_in_time(LONGER) if blur else 0
+            if not rounds:
+                told = replace(told, may_be_blur=blur)
                 break
     took(work)
     verdict = decide(replace(told, heldout=heldout.evidence if heldout else None))

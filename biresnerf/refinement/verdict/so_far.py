@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from biresnerf.data.model.dataset import Dataset
+from biresnerf.refinement.finish.expected_errors import expected_errors
+from biresnerf.refinement.finish.gather_evidence import without_patches
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.best_so_far import BestSoFar
 from biresnerf.refinement.stages.two_stages import TwoStages
 from biresnerf.refinement.start.refined_poses import RefinedPoses
 from biresnerf.refinement.verdict.judgement import compare_without_training
-from biresnerf.refinement.verdict.verdict import EPIPOLAR_MATTERS, decide
+from biresnerf.refinement.verdict.verdict import EPIPOLAR_MATTERS, decide, matches_are_better
 from biresnerf.report import Verdict
 
 UNMEASURED = (
@@ -73,7 +75,19 @@ def _verdict(stages: TwoStages, refined: RefinedPoses) -> Verdict:
     """By all but unseen views; where nothing else speaks for or against them, refined poses are offered."""
     lost = int(stages.optimiser.camera_errors.lost.sum())
     findings = compare_without_training(stages.scene, refined, lost).findings
+    if matches_are_better(findings):
+        findings = replace(findings, determined=_determined(stages))
     verdict = decide(findings)
     if findings.epipolar is not None or verdict.verdict != "inconclusive":
         return verdict
     return verdict.model_copy(update={"returned": "refined", "why": (UNMEASURED, *verdict.why)})
+
+
+def _determined(stages: TwoStages) -> float | None:
+    """The share of cameras whose present poses tracks determine; None where the method does not ask."""
+    optimiser = stages.optimiser
+    if not optimiser.method.uncertainty:
+        return None
+    poses = optimiser.poses.poses().numpy()
+    evidence = without_patches(stages.scene, optimiser).fitted
+    return float(expected_errors(poses, poses, evidence, bodies=optimiser.bodies).known.mean())

@@ -47,6 +47,7 @@ class Findings:
         determined: the share of cameras whose refined poses feature matches and photos determine; None if not known.
         favoured_by_positions: 1 where measured places fit the refined poses better beyond chance, -1 the input's, 0
             where neither, and their accuracy is stated; else None.
+        may_be_blur: whether a gain of unseen views may be blur, and there was no time to see whether it stands.
     """
 
     failed: tuple[str, ...]
@@ -63,6 +64,7 @@ class Findings:
     favoured_by_positions: Literal[-1, 0, 1] | None = None
     by_gimbal: bool = False
     determined: float | None = None
+    may_be_blur: bool = False
 
     @property
     def explained(self) -> bool:
@@ -236,7 +238,7 @@ def _views_are_better(f: Findings) -> bool:
 def _views_tell(f: Findings) -> bool:
     """Whether unseen views may speak alone, or against matches: poses that fit photos better may miss them by far."""
     missed = f.heldout.missed_px if f.heldout is not None else None
-    return missed is None or photos_tell(missed, f.moved_px)
+    return missed is None or (photos_tell(missed, f.moved_px) and not f.may_be_blur)
 
 
 def matches_are_better(f: Findings) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -58,12 +59,13 @@ def judged(
     given: np.ndarray,
     refined: np.ndarray,
     tracks: Tracks | None = None,
+    **how: Any,
 ) -> Judgement:
     """The verdict on a run that was given one set of poses and ended with the other."""
     dataset, images = scene
     optimiser = tiny_optimiser(with_poses(dataset, refined), images, OPTIONS, held_out=[3])
     run = replace(given_scene(with_poses(dataset, given), images, [3]), tracks=tracks)
-    return judge_poses(run, optimiser)
+    return judge_poses(run, optimiser, **how)
 
 
 def test_true_poses_in_place_of_noisy_ones_are_an_improvement(scene, noisy):
@@ -94,6 +96,21 @@ def test_a_gain_that_may_be_blurs_must_stand_in_longer_trainings_unless_matches_
     assert (matched.verdict, matched.heldout.steps <= steps) == ("improved", True)
     monkeypatch.setattr(compare_rigs, "BLUR_PX", 0.1)  # poses that miss by more are not what blur suits
     assert judged(scene, noisy, truth).verdict.heldout.steps <= steps
+
+
+def test_a_gain_that_may_be_blurs_says_nothing_where_time_ends_before_longer_trainings(scene, noisy):
+    asked: list[int] = []
+
+    def none_that_are_longer(times: int) -> int:
+        asked.append(times)
+        return int(times == 1)
+
+    truth = scene[0].world_from_cam
+    hurried = judged(scene, noisy, truth, rounds_in_time=none_that_are_longer).verdict
+    assert asked == [1, compare_rigs.LONGER]
+    assert hurried.heldout.psnr.finding == "better"
+    assert (hurried.verdict, hurried.returned) == ("inconclusive", "input")
+    assert "too much to tell" in hurried.why[0]
 
 
 def test_other_views_are_left_out_only_until_they_decide(scene):

@@ -100,6 +100,16 @@ def test_the_inputs_poses_are_offered_until_others_are_better_and_the_latest_ref
         assert latest.rotation_deg.max < 1e-3
 
 
+def test_matches_offer_no_poses_that_they_do_not_determine(scene, tmp_path):
+    matches = true_matches(scene[0])
+    apart = matches.where(matches.point % 3 == matches.image % 3)  # three groups, that nothing joins
+    open_, told = (Wandering(scene, tmp_path, 0.1, matches=each).at(0.01) for each in (apart, matches))
+    assert open_.verdict.epipolar.error_px.finding == "better"
+    assert (open_.verdict.verdict, open_.verdict.returned) == ("inconclusive", "input")
+    assert "do not determine the poses of most photos" in open_.verdict.why[0]
+    assert (told.verdict.verdict, told.verdict.returned) == ("improved", "refined")
+
+
 def test_poses_that_matches_cannot_tell_from_the_best_take_its_place_but_never_drift_away_from_it(
     scene, tmp_path
 ):
