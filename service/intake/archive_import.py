@@ -45,14 +45,14 @@ async def import_archive(
     """
     datasets = service.stores.datasets
     async with datasets.importing(dataset_id):
-        root = await _unpacked(service, dataset_id, archive)
+        root = await _unpacked(service, dataset_id, archive, upload_id)
         files = await asyncio.to_thread(_files_below, root)
         contents = {path.relative_to(root).as_posix(): partial(_chunks, path) for path in files}
         await datasets.add_files(dataset_id, contents, upload_id=upload_id)
     return await datasets.get(dataset_id)
 
 
-async def _unpacked(service: Service, dataset_id: str, archive: Path) -> Path:
+async def _unpacked(service: Service, dataset_id: str, archive: Path, upload_id: str | None) -> Path:
     """The folder of what the archive holds."""
     settings = service.settings
     dataset = await service.stores.datasets.get(dataset_id)
@@ -79,7 +79,7 @@ async def _unpacked(service: Service, dataset_id: str, archive: Path) -> Path:
         file_bytes=settings.max_file_bytes + 2**20,
     )
     try:
-        async with service.unpacking.turn(dataset.tenant):
+        async with service.unpacking.turn(dataset.tenant), service.stores.uploads.unpacking(upload_id):
             await run_confined("service.intake.unpack", request, limits)
     except ProblemError as error:
         if error.code == "archive_too_large" and room < allowed:
@@ -121,27 +121,36 @@ async def import_upload(service: Service, upload_id: str) -> None:
     uploads, token = service.stores.uploads, uuid.uuid4()
     if not await retry_while_unavailable(lambda: uploads.take(upload_id, token)):
         return
-    renewing = asyncio.create_task(_renew(service, upload_id, token))
     failure: JobError | None = None
     try:
-        await _add_to_dataset(service, await uploads.get(upload_id))
+        async with _renewed(service, upload_id, token):
+            await _add_to_dataset(service, await uploads.get(upload_id))
     except NotFound:
         return  # deleted meanwhile
-    except Exception as error:
+    except BaseException as error:
         failure = _client_error(error) if isinstance(error, FaultError) else None
         if failure is None:
-            await retry_while_unavailable(lambda: uploads.postpone(upload_id, token))
+            # This process may just be stopping: then another takes the upload at once.
+            await uploads.give_back(upload_id, token, failed=isinstance(error, Exception))
             raise
-    finally:
-        renewing.cancel()
     await retry_while_unavailable(lambda: uploads.conclude(upload_id, token, failure))
 
 
-async def _renew(service: Service, upload_id: str, token: uuid.UUID) -> None:
-    while True:
-        await asyncio.sleep(service.settings.beat_s / 2)
-        with contextlib.suppress(Unavailable):  # the next time will do
-            await service.stores.uploads.take(upload_id, token)
+@contextlib.asynccontextmanager
+async def _renewed(service: Service, upload_id: str, token: uuid.UUID) -> AsyncIterator[None]:
+    """Renews the lease for as long as the context lasts."""
+
+    async def renew() -> None:
+        while True:
+            await asyncio.sleep(service.settings.beat_s / 2)
+            with contextlib.suppress(Unavailable):  # the next time will do
+                await service.stores.uploads.take(upload_id, token)
+
+    renewing = asyncio.create_task(renew())
+    try:
+        yield
+    finally:
+        renewing.cancel()
 
 
 def _client_error(error: FaultError) -> JobError | None:

@@ -19,6 +19,10 @@ from workers.settings.errors import Unavailable
 
 log = logging.getLogger(__name__)
 
+# Work that takes its process down is given up after so many in a row. Kills that have nothing to do with it do not hit
+# it so often; whatever shows that it goes on begins the count anew.
+LOSSES_MAX = 4
+
 # Rows of `leased`, of each tenant the longest waiting.
 _CLAIM = """
     WITH waiting AS (

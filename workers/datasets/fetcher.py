@@ -19,7 +19,7 @@ from psycopg.types.json import Jsonb
 
 from biresnerf import __version__
 from biresnerf.errors import FaultError
-from workers.database.claimed_work import LeasedWork
+from workers.database.claimed_work import LOSSES_MAX, LeasedWork
 from workers.database.database import Database
 from workers.database.notifications import Listener
 from workers.datasets.uploads import PIECE_MAX_BYTES, UploadStore, require_size
@@ -36,7 +36,7 @@ from workers.webhooks.webhook_sender import pause
 
 log = logging.getLogger(__name__)
 
-ROUNDS_MAX, LOSSES_MAX = 5, 2
+ROUNDS_MAX = 5
 _MINE = "state = 'receiving' AND EXISTS (SELECT 1 FROM upload_fetches WHERE id = uploads.id AND token = %s)"
 _RANGE = re.compile(r"bytes (\d{1,18})-\d{1,18}/(\d{1,18})")
 
@@ -195,6 +195,7 @@ class Fetcher(LeasedWork):
                     "INSERT INTO upload_pieces (upload_id, start, size, key) VALUES (%s, %s, %s, %s)",
                     (upload.id, upload.received, len(piece), key),
                 )
+                await connection.execute("UPDATE upload_fetches SET losses = 0 WHERE id = %s", (upload.id,))
             if end == size:
                 await self._forget(connection, upload.id)
             await require_byte_quota(connection, upload.dataset_id, 0)

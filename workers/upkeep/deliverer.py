@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 
 from biresnerf import __version__
 from biresnerf.wire.problems import JobError
-from workers.database.claimed_work import LeasedWork
+from workers.database.claimed_work import LOSSES_MAX, LeasedWork
 from workers.database.database import Database
 from workers.database.notifications import Listener
 from workers.jobs.deliveries import DUE, lock_for_delivery, note_delivery
@@ -28,7 +28,6 @@ from workers.webhooks.webhook_sender import ROUNDS_MAX, pause
 
 log = logging.getLogger(__name__)
 
-LOSSES_MAX = 2
 # Stores take no more in one request, and larger zips are of a form that some programs cannot read.
 ZIP_BYTES_MAX = 2**31 - 1
 

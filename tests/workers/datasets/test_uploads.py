@@ -173,7 +173,7 @@ async def test_what_could_not_be_stored_waits_longer_each_time_and_is_rejected_i
         await stores.uploads.append(upload.id, 0, stream(b"abc"))
         token = uuid.uuid4()
         assert await stores.uploads.take(upload.id, token)
-        await stores.uploads.postpone(upload.id, token)
+        await stores.uploads.give_back(upload.id, token, failed=True)
         assert await stores.uploads.not_imported() == ()
         again = uuid.uuid4()
         assert await stores.uploads.take(upload.id, again), "who asks for it need not wait"
@@ -181,7 +181,7 @@ async def test_what_could_not_be_stored_waits_longer_each_time_and_is_rejected_i
         assert await stores.uploads.take(upload.id, again)
         await stores.uploads.expire()
         assert (await stores.uploads.get(upload.id)).state == "received", "somebody is at it"
-        await stores.uploads.postpone(upload.id, again)
+        await stores.uploads.give_back(upload.id, again, failed=True)
         await stores.uploads.expire()
         given_up = await stores.uploads.get(upload.id)
         assert given_up.state == "rejected"

@@ -21,6 +21,7 @@ from biresnerf.wire.jobs import JobView
 from tests.workers.conftest import Slots, ready_dataset
 from tests.workers.webhooks.conftest import dispatchers, settings
 from tests.workers.webhooks.webhook_receiver import PATIENCE_S, Dispatchers, Receiver
+from workers.database.claimed_work import LOSSES_MAX
 from workers.engine import Stores
 from workers.records import Artifact
 from workers.settings.errors import Conflict
@@ -157,7 +158,7 @@ async def test_a_repeated_request_with_other_addresses_is_the_same_job_and_keeps
     assert [row["url"] for row in rows] == ["http://127.0.0.1:9/a"]
 
 
-async def test_what_a_killed_dispatcher_was_sending_is_sent_by_the_next_and_the_second_loss_ends_it(
+async def test_what_a_killed_dispatcher_was_sending_is_sent_by_the_next_and_losses_in_a_row_end_it(
     stores: Stores, settings: Settings, slots: Slots, dispatchers: Dispatchers
 ):
     async with Receiver(None, b"200 OK").open() as receiver:
@@ -171,8 +172,8 @@ async def test_what_a_killed_dispatcher_was_sending_is_sent_by_the_next_and_the_
         assert len(receiver.messages) == 2
         await stores.jobs.deliver(job.id, DeliverTo(files={"log.txt": receiver.url}))
         with psycopg.connect(settings.require_database_url()) as connection:
-            lost = "UPDATE job_deliveries SET token = %s, leased_until = now(), losses = 1, due_at = now()"
-            connection.execute(lost, (uuid.uuid4(),))
+            lost = "UPDATE job_deliveries SET token = %s, leased_until = now(), losses = %s, due_at = now()"
+            connection.execute(lost, (uuid.uuid4(), LOSSES_MAX - 1))
         said = (await over(stores, job))["log.txt"].error
         assert (said.code, len(receiver.messages)) == ("delivery_failed", 2)
 

@@ -97,6 +97,7 @@ CREATE INDEX dataset_imports_dataset ON dataset_imports (dataset_id);
 
 -- Uploads under way. Their bytes lie below `folder` in the file store, which goes to the trash with the row.
 -- `take_token`, `take_until`: who brings a received upload into its dataset, and until when without a sign of life.
+-- `losses`: how many in a row were lost while they unpacked it.
 -- `brought`: bytes that the dataset has already, and that are counted there. `host`: where a dispatcher fetches them;
 -- until it knows their number, `size` is a byte more than there are.
 CREATE TABLE uploads (
@@ -114,6 +115,7 @@ CREATE TABLE uploads (
     error jsonb,
     take_token uuid,
     take_until timestamptz,
+    losses int NOT NULL DEFAULT 0,
     created_at timestamptz NOT NULL DEFAULT clock_timestamp(),
     expires_at timestamptz NOT NULL,
     CHECK ((kind = 'archive') = (path IS NULL))
