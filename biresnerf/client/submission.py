@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, Unpack
@@ -71,20 +72,9 @@ class Submissions(DatasetCalls, JobCalls, Uploads):
             InputError: the folder or the options cannot be used; nothing was sent then.
             ServiceError: the service refuses, or cannot be reached.
         """
-        wanted = as_options(options)
-        await tell(on_progress, Sending("reading"))
-        files = await _local_files(path, wanted.video_frames)
-        if resume is None:
-            folder = path.resolve()
-            title = (name or (folder.parent if folder.is_file() else folder).name or "scene")[:200]
-            target = await self.create_dataset(title, [file.entry for file in files])
-        else:
-            target = await self.dataset(resume)
-        body = NewJob(
-            dataset_id=target.id, options=wanted, labels=with_name(labels or {}, target.name), **details
-        )
-        filling = self._fill(target, files, on_progress)
-        return await self._submit_filled(target, filling, body, idempotency_key, resume is None, on_progress)
+        body = _body(options, labels, details)
+        ready = await self.send(path, body.options, name=name, resume=resume, on_progress=on_progress)
+        return await self._queued(ready, body, idempotency_key, resume is None, on_progress)
 
     async def submit_addresses(
         self,
@@ -107,27 +97,63 @@ class Submissions(DatasetCalls, JobCalls, Uploads):
         Raises:
             ServiceError: also where an address leads to no file, or to another one than was announced.
         """
-        wanted = as_options(options)
-        target = await (self.create_dataset(name[:200]) if resume is None else self.dataset(resume))
-        body = NewJob(
-            dataset_id=target.id, options=wanted, labels=with_name(labels or {}, target.name), **details
-        )
-        filling = self._fetch(target, () if resume is not None else files, on_progress)
-        return await self._submit_filled(target, filling, body, idempotency_key, resume is None, on_progress)
+        body = _body(options, labels, details)
+        ready = await self.send_addresses(files, name=name, resume=resume, on_progress=on_progress)
+        return await self._queued(ready, body, idempotency_key, resume is None, on_progress)
 
-    async def _submit_filled(
+    async def send(
         self,
-        target: DatasetView,
-        filling: Awaitable[DatasetView],
+        path: Path,
+        options: OptionsLike = None,
+        *,
+        name: str | None = None,
+        resume: str | None = None,
+        on_progress: Callable[[Sending], object] = lambda _: None,
+    ) -> DatasetView:
+        """What `submit` does before it queues a job; ``options`` say which frames of a video are sent."""
+        await tell(on_progress, Sending("reading"))
+        files = await _local_files(path, as_options(options).video_frames)
+        if resume is None:
+            folder = path.resolve()
+            title = (name or (folder.parent if folder.is_file() else folder).name or "scene")[:200]
+            target = await self.create_dataset(title, [file.entry for file in files])
+        else:
+            target = await self.dataset(resume)
+        async with self._discarding(target, resume is None):
+            return await self._fill(target, files, on_progress)
+
+    async def send_addresses(
+        self,
+        files: Sequence[FileAddress],
+        *,
+        name: str = "scene",
+        resume: str | None = None,
+        on_progress: Callable[[Sending], object] = lambda _: None,
+    ) -> DatasetView:
+        """What `submit_addresses` does before it queues a job."""
+        target = await (self.create_dataset(name[:200]) if resume is None else self.dataset(resume))
+        async with self._discarding(target, resume is None):
+            return await self._fetch(target, () if resume is not None else files, on_progress)
+
+    async def _queued(
+        self,
+        ready: DatasetView,
         body: NewJob,
         idempotency_key: str | None,
         fresh: bool,
         on_progress: Callable[[Sending], object],
     ) -> JobView:
-        try:
-            ready = await filling
-            await tell(on_progress, Sending("queueing", ready.files, dataset_id=target.id))
+        labels = with_name(body.labels, ready.name)
+        body = body.model_copy(update={"dataset_id": ready.id, "labels": labels})
+        await tell(on_progress, Sending("queueing", ready.files, dataset_id=ready.id))
+        async with self._discarding(ready, fresh):
             return await self._queue("/v1/jobs", body, idempotency_key or idempotency_key_of(body))
+
+    @asynccontextmanager
+    async def _discarding(self, target: DatasetView, fresh: bool) -> AsyncIterator[None]:
+        """Deletes a fresh dataset where what is done with it is refused."""
+        try:
+            yield
         except ServiceError as error:
             if error.users_fault and fresh:
                 await self._discard(target, error)
@@ -185,6 +211,11 @@ class Submissions(DatasetCalls, JobCalls, Uploads):
             await self.delete_dataset(target.id)
         except ServiceError as error:
             cause.add_note(f"The dataset {target.id} remains on the service: {error}")
+
+
+def _body(options: OptionsLike, labels: Mapping[str, str] | None, details: JobDetails) -> NewJob:
+    """The job to queue once its dataset is there; raises `InputError` before anything is sent."""
+    return NewJob(dataset_id="", options=as_options(options), labels=dict(labels or {}), **details)
 
 
 async def _local_files(path: Path, video_frames: int) -> list[LocalFile]:

@@ -1,14 +1,15 @@
-"""`biresnerf submit PATH`: sends a set to a service, or says where it is, and fetches the result."""
+"""`biresnerf submit PATH...`: sends sets to a service, or says where they are, and fetches the results."""
 
 from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import urlsplit
 
 import click
 
@@ -18,12 +19,14 @@ from biresnerf.commands.empty_folder import require_empty
 from biresnerf.commands.jobs.follow_job import follow_options, see_through
 from biresnerf.commands.jobs.job_progress import SendingView
 from biresnerf.commands.jobs.service_options import service_at, service_options
+from biresnerf.commands.jobs.submit_several import name_of, require_several, submit_several
 from biresnerf.commands.settings_option import budget_option, settings_option
 from biresnerf.wire.jobs import DEADLINE_MOST_S
 
 if TYPE_CHECKING:
     from biresnerf.client import Client, FileAddress, Sending
     from biresnerf.options.refine_options import RefineOptions
+    from biresnerf.wire.datasets import DatasetView
     from biresnerf.wire.jobs import JobView
 
 
@@ -64,7 +67,7 @@ class _SetParameter(click.ParamType):
 
 
 @click.command("submit")
-@click.argument("path", type=_SetParameter())
+@click.argument("paths", type=_SetParameter(), nargs=-1, required=True, metavar="PATH...")
 @click.option("--preset", help="fast, balanced, quality or paper.")
 @budget_option
 @settings_option
@@ -103,23 +106,24 @@ class _SetParameter(click.ParamType):
 @service_options
 @json_option
 def submit_command(
-    path: Path | str,
+    paths: tuple[Path | str, ...],
     preset: str | None,
     time_budget_s: float | None,
     settings: dict[str, Any],
-    wait: bool,
-    timeout_s: float | None,
     output: Path | None,
     url: str | None,
     api_key: str | None,
-    as_json: bool,
     deliver: str | None,
     **how: Any,
 ) -> None:
-    """Submit PATH to a service as a job.
+    """Submit PATH to a service as a job, or several as a batch of jobs.
 
     PATH is a folder of images, or a file with poses in one. Sends only files that the service lacks, and prints the
     job's address. Ctrl-C while waiting leaves the job running.
+
+    Of several sets, those that the service refuses are named and left out. A line for each other has the address of its
+    job and the PATH; --output gets a folder for each. The exit status is 2 if a set was refused, else 3 if a job that
+    was waited for did not succeed.
 
     PATH may also be the address of an archive (https://...), or a folder or archive in a bucket (s3://bucket/prefix).
     The service fetches these itself. Addresses of a bucket are signed here: your credentials stay on this machine.
@@ -130,22 +134,46 @@ def submit_command(
     options = parse_options({**settings, **{key: value for key, value in named.items() if value}})
     if output is not None:
         require_empty(output)
+    follow = {"output": output, **{name: how.pop(name) for name in ("wait", "timeout_s", "as_json")}}
+    how = {key: value for key, value in how.items() if value is not None}
+    if len(paths) > 1:
+        require_several(paths, deliver, how)
     with service_at(url, api_key) as client:
+        if len(paths) > 1:
+            submit_several(
+                client, paths, options, partial(_sent, client, options), deliver=deliver, **follow, **how
+            )
+            return
         if deliver is not None:
             from biresnerf.client import bucket_target
 
             how["deliver"] = bucket_target(deliver)
-        job = submitted(
-            client, path, options, **{key: value for key, value in how.items() if value is not None}
-        )
-        see_through(client, job, wait=wait, timeout_s=timeout_s, output=output, as_json=as_json)
+        see_through(client, _submitted(client, paths[0], options, how), **follow)
 
 
-def submitted(client: Client, path: Path | str, options: RefineOptions, **how: Any) -> JobView:
+def _submitted(client: Client, path: Path | str, options: RefineOptions, how: dict[str, Any]) -> JobView:
     """Submits a folder or what is at an address, with progress on standard error.
 
     After Ctrl-C it prints the command that resumes.
     """
+    with _sending(again_as_it_is="resume" in how) as note:
+        if isinstance(path, Path):
+            return client.submit(path, options, on_progress=note, **how)
+        files = () if how.get("resume") else _files_at(path)
+        return client.submit_addresses(files, options, name=name_of(path), on_progress=note, **how)
+
+
+def _sent(client: Client, options: RefineOptions, name: str, path: Path | str) -> DatasetView:
+    """One of several sets, checked."""
+    click.echo(f"{name}:", err=True)
+    with _sending(again_as_it_is=True) as note:
+        if isinstance(path, Path):
+            return client.send(path, options, name=name, on_progress=note)
+        return client.send_addresses(_files_at(path), name=name, on_progress=note)
+
+
+@contextmanager
+def _sending(*, again_as_it_is: bool) -> Iterator[Callable[[Sending], None]]:
     last: Sending | None = None
 
     def note(sending: Sending) -> None:
@@ -155,13 +183,15 @@ def submitted(client: Client, path: Path | str, options: RefineOptions, **how: A
 
     with SendingView() as view:
         try:
-            if isinstance(path, Path):
-                return client.submit(path, options, on_progress=note, **how)
-            files = () if how.get("resume") else _files_at(path)
-            name = urlsplit(path).path.rstrip("/").rpartition("/")[2] or urlsplit(path).netloc
-            return client.submit_addresses(files, options, name=name, on_progress=note, **how)
+            yield note
         except KeyboardInterrupt:
-            _print_how_to_resume(last, how.get("resume"))
+            dataset = None if last is None else last.dataset_id
+            if dataset is None and not again_as_it_is:
+                click.echo("Stopped before anything was sent.", err=True)
+            else:
+                again = ["biresnerf", *sys.argv[1:], *(() if again_as_it_is else ("--resume", str(dataset)))]
+                click.echo("Stopped; the service keeps what it has received. To resume:", err=True)
+                click.echo(f"  {shlex.join(again)}", err=True)
             raise click.exceptions.Exit(exit_codes.SIGINT) from None
 
 
@@ -169,12 +199,3 @@ def _files_at(address: str) -> Sequence[FileAddress]:
     from biresnerf.client import FileAddress, bucket_files
 
     return bucket_files(address) if address.startswith("s3://") else (FileAddress(url=address),)
-
-
-def _print_how_to_resume(last: Sending | None, resumed: str | None) -> None:
-    if last is None or last.dataset_id is None:
-        click.echo("Stopped before anything was sent.", err=True)
-        return
-    again = ["biresnerf", *sys.argv[1:], *(() if resumed else ("--resume", last.dataset_id))]
-    click.echo("Stopped; the service keeps what it has received. To resume:", err=True)
-    click.echo(f"  {shlex.join(again)}", err=True)

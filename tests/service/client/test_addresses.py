@@ -22,6 +22,8 @@ from workers.store.file_places import Bucket
 
 pytestmark = pytest.mark.server
 FAST = {"preset": "fast", "steps": 20, "seed": 5}
+FAST_SET = ("--preset", "fast", "--set", "steps=20", "--set", "seed=5")
+COMMAND = (sys.executable, "-m", "biresnerf.command_line", "submit")
 
 
 @pytest.fixture
@@ -122,9 +124,8 @@ def test_an_address_that_leads_to_nothing_fails_by_name_and_leaves_no_dataset(
 def test_the_command_has_the_result_sent_into_the_callers_bucket(
     http: httpx.Client, service: Running, scene: Path, bucket: Bucket
 ) -> None:
-    command = [sys.executable, "-m", "biresnerf.command_line", "submit", str(scene), "--preset", "fast"]
     done = subprocess.run(
-        [*command, "--set", "steps=20", "--set", "seed=5", "--deliver", f"s3://{bucket.name}/results/"],
+        [*COMMAND, str(scene), *FAST_SET, "--deliver", f"s3://{bucket.name}/results/"],
         env={**os.environ, "BIRESNERF_URL": service.url},
         capture_output=True,
         text=True,
@@ -152,3 +153,26 @@ def test_the_command_has_the_result_sent_into_the_callers_bucket(
     refused = http.post(f"/v1/jobs/{job}/deliver", json={"archive": "http://169.254.169.254/?SECRET"})
     assert "SECRET" not in problem(refused, 422, "address_refused")["detail"]
     problem(http.post(f"/v1/jobs/{job}/deliver", json={}), 422, "invalid_request")
+
+
+def test_of_several_sets_from_here_and_a_bucket_each_result_has_a_folder_of_its_own_there(
+    http: httpx.Client, service: Running, scene: Path, bucket: Bucket
+) -> None:
+    put(bucket, {f"far/{name}": content for name, content in scene_files(scene).items()})
+    there = f"s3://{bucket.name}"
+    done = subprocess.run(
+        [*COMMAND, str(scene), f"{there}/far", *FAST_SET, "--deliver", f"{there}/results"],
+        env={**os.environ, "BIRESNERF_URL": service.url},
+        capture_output=True,
+        text=True,
+        timeout=90,
+    )
+    assert done.returncode == 0, done.stderr
+    for line in done.stdout.splitlines():
+        job = line.split()[0].rpartition("/")[2]
+        until(http, job, lambda now: now["delivered"][0]["state"] == "delivered")
+    keys = {
+        item["Key"]
+        for item in by_boto(bucket).list_objects_v2(Bucket=bucket.name, Prefix="results/")["Contents"]
+    }
+    assert keys == {f"results/{scene.name}/result.zip", "results/far/result.zip"}

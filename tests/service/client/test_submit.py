@@ -176,6 +176,66 @@ def test_ctrl_c_ends_the_waiting_and_not_the_job(http: httpx.Client, service: Ru
     assert finished(http, url.rsplit("/", 1)[1])["state"] == "succeeded"
 
 
+def copies(scene: Path, folder: Path, *names: str) -> list[Path]:
+    for name in names:
+        shutil.copytree(scene, folder / name)
+    return [folder / name for name in names]
+
+
+def test_several_sets_become_one_batch_with_a_line_and_a_folder_for_each(
+    http: httpx.Client, service: Running, scene: Path, tmp_path: Path
+) -> None:
+    hall, kitchen, alike = copies(scene, tmp_path, "hall", "kitchen", "other/hall")
+    output = tmp_path / "out"
+    done = submit(service, hall, kitchen / "transforms.json", alike, *FAST, "--label", "day=1", "-o", output)
+    assert done.returncode == 0, done.stderr
+    lines = [line.split("  ") for line in done.stdout.splitlines()]
+    assert [path for _, path in lines] == [str(hall), str(kitchen / "transforms.json"), str(alike)]
+    jobs = [http.get(f"/v1/jobs/{url.removeprefix(f'{service.url}/#/jobs/')}").json() for url, _ in lines]
+    assert [job["labels"] for job in jobs] == [
+        {"name": name, "day": "1"} for name in ("hall", "kitchen", "hall-2")
+    ]
+    assert [job["state"] for job in jobs] == ["succeeded"] * 3
+    (batch,) = {job["batch_id"] for job in jobs}
+    assert [job["id"] for job in http.get(f"/v1/batches/{batch}").json()["jobs"]] == [
+        job["id"] for job in jobs
+    ]
+    for name in ("hall", "kitchen", "hall-2"):
+        assert (output / name / "report.json").is_file()
+        assert re.search(rf"^{name}: succeeded", done.stderr, re.MULTILINE)
+
+
+def test_of_several_sets_a_bad_one_is_named_and_the_others_are_queued(
+    http: httpx.Client, service: Running, scene: Path, tmp_path: Path
+) -> None:
+    good, bad, better = copies(scene, tmp_path, "good", "bad", "better")
+    whole = (bad / "train" / "r_2.png").read_bytes()
+    (bad / "train" / "r_2.png").write_bytes(whole[: len(whole) // 2])
+    done = submit(service, good, bad, tmp_path / "nowhere", better, *FAST, "--json")
+    assert done.returncode == 2, done.stderr
+    assert [job["labels"]["name"] for job in json.loads(done.stdout)["jobs"]] == ["good", "better"]
+    for job in json.loads(done.stdout)["jobs"]:
+        assert finished(http, job["id"])["state"] == "succeeded"
+    assert re.search(rf"^{re.escape(str(bad))}: .*r_2", done.stderr, re.MULTILINE)
+    assert f"{tmp_path / 'nowhere'}: " in done.stderr
+    assert done.stderr.splitlines()[-1] == "error: 2 of 4 sets cannot be used."
+    names = [item["name"] for item in http.get("/v1/datasets").json()["items"]]
+    assert "bad" not in names, "its dataset is deleted"
+
+
+def test_of_several_jobs_one_that_fails_decides_the_exit_status(
+    service: Running, scene: Path, tmp_path: Path
+) -> None:
+    done = submit(service, *copies(scene, tmp_path, "a", "b"), "--set", "threads=77", "--wait")
+    assert done.returncode == 3, done.stderr
+    assert re.search(r"^a: failed, .*diverged", done.stderr, re.MULTILINE)
+    assert done.stderr.splitlines()[-1] == "error: 2 of 2 jobs did not succeed."
+    for alone in (("--resume", "ds_1"), ("--fixed-from", "job_1"), ("--deliver", "s3://bucket/one.zip")):
+        refused = submit(service, tmp_path / "a", tmp_path / "b", *alone)
+        assert (refused.returncode, refused.stdout) == (2, "")
+        assert alone[0] in refused.stderr
+
+
 CONTENT = os.urandom(300_000)
 
 
