@@ -11,6 +11,8 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 TOOLS := $(VENV)/tools
 TARGETS ?= lint test
+# Whose fresh environments a release is tried in.
+PYTHONS ?= $(PYTHON)
 CONSUMERS := build/consumers
 # Pins for what is installed and, under the names that older and newer pips know, for what builds it.
 CONSTRAINTS ?= constraints.txt
@@ -20,7 +22,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Each process of the tests would compile all modules, and pytest rewrite all assertions, again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup web test test-nightly test-fast test-kernels test-lowest test-pythons coverage lint format demo serve bench field-check docs docs-site notebooks screenshots fuzz promises audit sbom compose-check slurm-check consumers-check
+.PHONY: help setup web test test-nightly test-fast test-kernels test-lowest test-pythons coverage lint format demo serve bench field-check docs docs-site notebooks screenshots fuzz promises audit sbom compose-check slurm-check consumers-check release
 .DELETE_ON_ERROR:
 
 help:  ## what there is
@@ -115,6 +117,9 @@ slurm-check: setup  ## workers for what waits on a real Slurm of one node; loses
 consumers-check: setup $(CONSUMERS)/.installed  ## what other programs' own readers make of what is written; their environment is some 4 GB
 	BIRESNERF_CONSUMERS=$(abspath $(CONSUMERS)) $(BIN)/python -m pytest -n 0 tests/consumers $(PYTEST)
 
+release: $(TOOLS)  ## wheel and source distribution in build/release, checked, and tried alone; PYTHONS="python3.11 python3.12" chooses
+	$(TOOLS)/bin/python .ci/release.py $(PYTHONS)
+
 # nerfstudio pins old versions of libraries that its parsers work without, and bpy an old NumPy.
 $(CONSUMERS)/.installed: tests/consumers/requirements.txt
 	$(PYTHON) -m venv --clear $(CONSUMERS)
@@ -125,7 +130,7 @@ $(CONSUMERS)/.installed: tests/consumers/requirements.txt
 # Tools that need libraries of their own stay out of the environment that they look at.
 $(TOOLS): constraints.txt
 	$(PYTHON) -m venv --clear $(TOOLS)
-	$(TOOLS)/bin/python -m pip install --quiet -c constraints.txt pip-audit cyclonedx-bom
+	$(TOOLS)/bin/python -m pip install --quiet -c constraints.txt pip-audit cyclonedx-bom build twine
 	@touch $@
 
 # Without ensurepip the venv module leaves half an environment behind, so it is looked for first.

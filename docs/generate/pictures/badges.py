@@ -1,4 +1,4 @@
-"""docs/pictures/badge_*.svg: what pyproject.toml says of version, Python and licence, as pictures for the README."""
+"""docs/pictures/badge_*.svg: version, Python and licence, as pictures for the README."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from functools import partial
 from html import escape
 from pathlib import Path
 
+from biresnerf import __version__
+
 HEIGHT, PER_LETTER, MARGIN = 20, 6.7, 7  # px
 
 
@@ -17,7 +19,7 @@ def badges(root: Path) -> dict[Path, Callable[[], str]]:
     project = tomllib.loads((root / "pyproject.toml").read_text("utf-8"))["project"]
     pythons = re.findall(r"Python :: (3\.\d+)", "\n".join(project["classifiers"]))
     python = f"{pythons[0]} to {pythons[-1]}"
-    said = {"version": project["version"], "python": python, "licence": project["license"]}
+    said = {"version": __version__, "python": python, "licence": project["license"]}
     return {
         root / f"docs/pictures/badge_{name}.svg": partial(badge, name, value) for name, value in said.items()
     }
