@@ -73,7 +73,7 @@ def check_contents(wheel: Path, sdist: Path) -> str:
 
 
 def try_alone(python: str, wheel: Path) -> None:
-    """Install the wheel into a fresh environment, and refine there what the quick start refines, in little."""
+    """Install the wheel and the pinned libraries into a fresh environment, and refine a small made scene there."""
     with tempfile.TemporaryDirectory() as folder:
         run(python, "-m", "venv", f"{folder}/alone")
         # No program but Python and what the system has: no Node, no git, no compiler.
@@ -81,6 +81,7 @@ def try_alone(python: str, wheel: Path) -> None:
         environment |= {
             name: value for name, value in os.environ.items() if name.startswith(("PIP_", "SSL_"))
         }
+        environment["PIP_CONSTRAINT"] = str(ROOT / "constraints.txt")
         run("python", "-m", "pip", "install", "--quiet", str(wheel), cwd=folder, env=environment)
         for command in QUICK_START:
             last = run("biresnerf", *command, cwd=folder, env=environment)
