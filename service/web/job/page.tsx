@@ -14,6 +14,7 @@ import { NotifySwitch } from "../parts/notify";
 import { ProblemBox } from "../parts/problem_box";
 import { useTitle } from "../parts/title";
 import { Actions } from "./actions";
+import { Deliveries } from "./deliveries";
 import { Failure } from "./failure";
 import { LiveJob, type LiveState } from "./live_job";
 import { LogView } from "./log";
@@ -38,6 +39,7 @@ export function JobPage({ id }: { id: string }) {
       <Announced job={job} />
       <Views seen={seen} />
       <Files live={live} seen={seen} />
+      {job.delivered.length > 0 && <Deliveries job={job} />}
       <Facts job={job} seen={seen} />
       {!guest && <LogView job={job} />}
     </article>

@@ -10,8 +10,8 @@ import { ProblemBox } from "../parts/problem_box";
 import { useTitle } from "../parts/title";
 import { CheckTable } from "./check_table";
 import { DropZone } from "./drop";
+import { Unfinished } from "./fetches";
 import { NewJob } from "./new_job";
-import { ResumeUpload } from "./resume_upload";
 import { transfers } from "./send";
 import type { Transfer } from "./transfer";
 
@@ -34,7 +34,7 @@ export function DatasetPage({ id }: { id: string }) {
       </header>
       {transfer && dataset.state === "open" && <Progress transfer={transfer} />}
       {transfer?.problem && <ProblemBox problem={transfer.problem} />}
-      {interrupted && <ResumeUpload dataset={dataset} onStarted={() => rerender((n) => n + 1)} />}
+      {interrupted && <Unfinished dataset={dataset} onStarted={() => rerender((n) => n + 1)} />}
       {dataset.state === "ready" ? <NewJob key={dataset.id} dataset={dataset} /> : <CheckTable dataset={dataset} />}
       {dataset.state === "rejected" && dataset.error && (
         <ProblemBox problem={dataset.error} heading="The image set was rejected" />
