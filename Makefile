@@ -36,7 +36,7 @@ web: setup  ## build the page and what report.html is made of, after a change of
 test: web  ## all tests but those of test-nightly; PYTEST="-k name" chooses
 	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --maxprocesses 4 --dist loadfile --no-loadscope-reorder -m "not nightly" $(PYTEST)
 
-test-nightly: web  ## what takes long and seldom fails alone: deployment, pages' commands, notebooks, fuzz, storms, studies, benchmarks
+test-nightly: web  ## what takes long and seldom fails alone: deployment, pages' commands, notebooks, fuzz, storms, studies, benchmarks, GPU kernels in an interpreter
 	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --maxprocesses 4 --dist loadfile --no-loadscope-reorder -m nightly $(PYTEST)
 
 test-fast: setup  ## within a minute: the tests that need no server and no browser and do not train

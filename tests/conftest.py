@@ -31,6 +31,7 @@ NIGHTLY = (
     "tests/docs/test_documented_commands.py",
     "tests/docs/test_notebooks.py",
     "tests/docs/test_typescript.py",
+    "tests/field/cuda/",
     "tests/service/test_fuzz.py",
     "tests/studies/commands/",
     "tests/test_benchmarks.py",
