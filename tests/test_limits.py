@@ -19,10 +19,8 @@ ALONE = (
 )
 OFFCUTS = {
     "biresnerf/options/validated_options.py",  # refuses words; `refine_options` declares, and nothing else
-    "biresnerf/refinement/lost/matched_repair.py",
     "biresnerf/refinement/parameters/ring_parameters.py",
     "biresnerf/refinement/stages/timing.py",
-    "biresnerf/refinement/verdict/camera_reports.py",
 }
 DRAWERS = {"utils", "helpers", "common", "core", "misc"}
 SOURCES = [

@@ -17,8 +17,7 @@ from torch import Tensor
 from biresnerf.field.radiance_field import Marching, PositionGradient, Rays, Rendering
 from biresnerf.frozen_model import FrozenModel
 from biresnerf.geometry.pose_error import rotation_between_deg
-from biresnerf.refinement.lost.matched_repair import MatchedRepair
-from biresnerf.refinement.lost.own_matches import OwnMatches
+from biresnerf.refinement.lost.own_matches import OwnMatches, better, contradicted
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.pose_hypotheses import pose_hypotheses
 from biresnerf.refinement.parameters.pose_parameters import PoseParameters
@@ -46,6 +45,45 @@ SETTLED_SHARE = 1 / 3  # of stage 2, at the least before that
 RUN_SHARE, EVENT_SHARE = 0.1, 0.04  # of the run's samples: what all repairs may cost, and those of one time
 GUESSED_TIMES = 2  # that much where poses are guesses: more cameras need it
 FORWARD_COST = 0.4  # of a sample without its backward pass
+
+
+class MatchedRepair:
+    """What the matches of single cameras say to their repair; nothing where there are none.
+
+    Args:
+        own: the photos' feature matches.
+    """
+
+    def __init__(self, optimiser: JointOptimiser, own: OwnMatches | None) -> None:
+        self.optimiser, self._own = optimiser, own
+
+    def place(self) -> list[int]:
+        """Give cameras that their own matches contradict a pose that those support, the worst first; returns which."""
+        if self._own is None:
+            return []
+        optimiser, placed = self.optimiser, []
+        errors = self._own.errors_px(optimiser.poses.poses().numpy())
+        wrong = contradicted(errors) & optimiser.bodies.alone
+        trusted = ~(wrong | optimiser.camera_errors.suspects.cpu().numpy())
+        for camera in np.argsort(-np.nan_to_num(errors) * wrong)[: int(wrong.sum())].tolist():
+            found = self._own.placed(camera, optimiser.poses.poses().numpy(), trusted)
+            logger.info(
+                "the matches of camera %d are off by %.3g px and %s",
+                camera, errors[camera], "place it elsewhere" if found is not None else "do not place it",
+            )  # fmt: skip
+            if found is not None:
+                optimiser.replace_pose(camera, torch.from_numpy(found[:3]).float().to(optimiser.device))
+                placed.append(camera)
+        return placed
+
+    def object_to(self, camera: int, unit_from_cam: Tensor) -> bool:
+        """Whether a camera's own matches fit another pose [3, 4] less well than its present one."""
+        if self._own is None:
+            return False
+        now = self.optimiser.poses.poses().numpy()
+        moved = now.copy()
+        moved[camera, :3] = unit_from_cam.double().cpu().numpy()
+        return better(camera, self._own.errors_px(moved), self._own.errors_px(now))
 
 
 class RepairState(FrozenModel):

@@ -19,18 +19,18 @@ from biresnerf.refinement.lost.own_matches import LEAST_PAIRS
 from biresnerf.refinement.optimise.device_memory import smaller_batches
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.method_changes import method_warnings
+from biresnerf.refinement.parameters.intrinsics_parameters import FocalCertainty, IntrinsicsParameters
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.two_stages import TwoStages
 from biresnerf.refinement.start.choose_start import MARGIN_DB
 from biresnerf.refinement.start.matches_explained import explained_from_one_place
 from biresnerf.refinement.start.refined_poses import RefinedPoses
-from biresnerf.refinement.verdict.camera_reports import camera_reports, focal_warnings
 from biresnerf.refinement.verdict.judgement import Judgement, motion
 from biresnerf.refinement.verdict.pose_uncertainty import FIXED
 from biresnerf.refinement.verdict.so_far import SoFar
 from biresnerf.refinement.views.evaluation import ViewScore
 from biresnerf.refinement.views.floaters import unshared_opacity
-from biresnerf.report import HeldOut, ImageReport, Report
+from biresnerf.report import CameraReport, HeldOut, ImageReport, Report
 from biresnerf.uncertainty import PoseUncertainty
 
 ONE_PLACE = 0.9  # of the matches, within 0.3 % of the photo's long side
@@ -94,6 +94,47 @@ def run_report(
         + budget_warnings(stages)
         + _unknown_warnings(dataset, uncertainty),
     )
+
+
+def camera_reports(dataset: Dataset, lenses: IntrinsicsParameters) -> tuple[CameraReport, ...]:
+    """The set's cameras before and after refinement."""
+    used = [frame.camera for frame in dataset.frames]
+    after, parts = lenses.refined(dataset).cameras, lenses.refined_parts
+    return tuple(
+        CameraReport(
+            model=old.model,
+            width=old.width,
+            height=old.height,
+            source=dataset.source_of_intrinsics(i),
+            refined=parts[i],
+            images=used.count(i),
+            params_before=old.params,
+            params_after=new.params,
+            focal_deviation_percent=_percent(lenses.certainty[i]),
+            observable=None if (known := lenses.certainty[i]) is None else known.observable,
+        )
+        for i, (old, new) in enumerate(zip(dataset.cameras, after, strict=True))
+    )
+
+
+def _percent(known: FocalCertainty | None) -> float | None:
+    return None if known is None or known.deviation is None else 100 * known.deviation
+
+
+def focal_warnings(dataset: Dataset, lenses: IntrinsicsParameters) -> tuple[str, ...]:
+    """Of focal lengths that were given and kept, although the evidence clearly prefers others."""
+    found = []
+    for i, known in enumerate(lenses.certainty):
+        if known is None or known.contradicts is None or known.deviation is None:
+            continue
+        longer = "longer" if known.contradicts > 1 else "shorter"
+        name = next(frame.name for frame in dataset.frames if frame.camera == i)
+        found.append(
+            f"Feature matches fit better with a focal length {abs(known.contradicts - 1):.1%} {longer} than given for "
+            f"{name} and the images that share its camera (standard deviation {known.deviation:.2%}). It was kept; "
+            "refine_intrinsics=focal has it refined."
+        )
+    return tuple(found)
 
 
 def held_out_report(optimiser: JointOptimiser, scores: list[ViewScore]) -> HeldOut:

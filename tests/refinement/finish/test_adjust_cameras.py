@@ -21,7 +21,7 @@ from biresnerf.refinement.lost.lost_cameras import LostCameraRepair
 from biresnerf.refinement.lost.own_matches import OwnMatches
 from biresnerf.refinement.parameters.intrinsics_parameters import lenses_of
 from biresnerf.refinement.stages.two_stages import TwoStages
-from biresnerf.refinement.verdict.camera_reports import camera_reports, focal_warnings
+from biresnerf.refinement.verdict.run_report import camera_reports, focal_warnings
 from tests.refinement.adjustment.rig import disturbed, observed, rotation_errors_deg
 from tests.refinement.tiny_scene import given_scene, tiny_optimiser, tiny_options, tiny_set
 

@@ -11,7 +11,7 @@ import torch
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.pixel_rays import pixels_of_points
 from biresnerf.geometry.pose_error import rotation_between_deg
-from biresnerf.refinement.lost.matched_repair import MatchedRepair
+from biresnerf.refinement.lost.lost_cameras import MatchedRepair
 from biresnerf.refinement.lost.own_matches import OwnMatches
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from tests.refinement.tiny_scene import given_scene, tiny_optimiser, tiny_options, tiny_set

@@ -26,7 +26,7 @@ from biresnerf.refinement.parameters.intrinsics_parameters import (
 )
 from biresnerf.refinement.parameters.pose_parameters import PoseParameters, dolly_directions
 from biresnerf.refinement.scene.scene_frame import scene_frame
-from biresnerf.refinement.verdict.camera_reports import camera_reports
+from biresnerf.refinement.verdict.run_report import camera_reports
 from tests.refinement.tiny_scene import photos_set, tiny_optimiser, tiny_options, tiny_set
 
 pytestmark = pytest.mark.slow
