@@ -30,14 +30,17 @@ from biresnerf.forecast.rates import machine_rates, remember_rates
 from biresnerf.forecast.run_forecast import TELLING_S, Forecast
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.progress import Monitor, OnProgress, Progress, told_before_the_run
-from biresnerf.refinement.finish.rounds import run_stage_2
-from biresnerf.refinement.finish.time_budget import keep_to_budget
-from biresnerf.refinement.finish.work_ahead import expect_rest, expect_run
+from biresnerf.refinement.finish.rounds import run_rounds
+from biresnerf.refinement.finish.work_ahead import expect_rest, expect_run, keep_to_budget
+from biresnerf.refinement.lost.lost_cameras import LostCameraRepair
+from biresnerf.refinement.lost.own_matches import OwnMatches
+from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.methods import Method, Recipe
 from biresnerf.refinement.parameters.rigid_bodies import rigid_bodies
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.checkpoint import SEEDING, TRACKS, Checkpoint, RunOrigin
-from biresnerf.refinement.stages.two_stages import Observer, TwoStages
+from biresnerf.refinement.stages.run_state import RunState
+from biresnerf.refinement.stages.two_stages import TwoStages
 from biresnerf.refinement.start.choose_start import find_start
 from biresnerf.refinement.start.first_step import first_step, stage_lengths
 from biresnerf.refinement.verdict.evaluate import Evaluation, evaluate
@@ -52,6 +55,19 @@ from biresnerf.stages import Stage
 from biresnerf.write.output_folder import OutputFolder
 from biresnerf.write.preview import SeedingPreview, write_preview
 from biresnerf.write.result import ResultPictures, write_result
+
+
+@dataclass(frozen=True)
+class Observer:
+    """Looks into a run on its way; the run does not depend on what it sees.
+
+    Attributes:
+        at_check: what it returns at each check joins that check's line of the history.
+        at_end: called once, when the poses are final.
+    """
+
+    at_check: Callable[[JointOptimiser], dict[str, float]] = lambda _optimiser: {}
+    at_end: Callable[[Scene, JointOptimiser], None] = lambda _scene, _optimiser: None
 
 
 def refine_poses(
@@ -94,10 +110,10 @@ def refine_poses(
         folder.remove_result()
     with share.watching(), KernelCompilation() as kernels:
         setup = _set_up(folder, options, method, on_progress, should_stop, share, kernels)
-        return _refine(input, setup, observer, started)
+        return _refine(input, setup, observer or Observer(), started)
 
 
-def _refine(input: str | Path | Dataset, setup: _Setup, observer: Observer | None, started: float) -> Report:
+def _refine(input: str | Path | Dataset, setup: _Setup, observer: Observer, started: float) -> Report:
     dataset = input if isinstance(input, Dataset) else _read(Path(input), setup)
     dataset = without_copies(without_photos(dataset, setup.asked.leave_out), setup.asked.fixed)
     dataset = with_shared_predictions(dataset)
@@ -105,27 +121,32 @@ def _refine(input: str | Path | Dataset, setup: _Setup, observer: Observer | Non
     dataset = replace(dataset, positions=position_priors(dataset), control=control_points(dataset))
     scene, origin = _seed(dataset, setup)
     stages = _first_step(scene, origin, setup, observer)
-    keep_to_budget(stages, started, setup.recipe.options.steps)
-    stages.spent("preparing", time.monotonic() - started)
+    optimiser, repair, run = stages.optimiser, stages.repair, stages.run
+    keep_to_budget(scene, optimiser, run, started, setup.recipe.options.steps)
+    run.spent("preparing", time.monotonic() - started)
 
     evaluation, judgement = Evaluation(), None
     try:
         stages.run_stage_1()
-        finish = run_stage_2(stages)
-        stages.observer.at_end(stages)
+        finish = run_rounds(stages, scene)
+        observer.at_end(scene, optimiser)
         pictures = ResultPictures(setup.folder, scene)
-        evaluation = evaluate(stages, pictures)
-        judgement = judge(stages, finish)
+        evaluation = evaluate(scene, optimiser, run, pictures)
+        judgement = judge(scene, optimiser, run, finish)
         if judgement is not None:
             shown = pictures.write_before_after(evaluation.views, judgement.renders)
             evaluation = replace(evaluation, views=shown)
-        known = pose_uncertainty(stages, finish, judgement)
-        report = run_report(stages, evaluation.scores, judgement, "complete", finish, known)
-        report = write_result(setup.folder, stages, evaluation, report)
+        known = pose_uncertainty(scene.dataset, optimiser, finish, judgement)
+        report = run_report(
+            scene, optimiser, run.record, repair.repaired, evaluation.scores, judgement, finish, known
+        )
+        report = write_result(setup.folder, scene, optimiser, setup.monitor, evaluation, report)
     except Interrupted:
-        so_far = poses_so_far(stages) if judgement is None else None
-        report = run_report(stages, evaluation.scores, judgement, "partial", so_far=so_far)
-        write_result(setup.folder, stages, evaluation, report, so_far)
+        so_far = poses_so_far(scene, optimiser, run) if judgement is None else None
+        report = run_report(
+            scene, optimiser, run.record, repair.repaired, evaluation.scores, judgement, so_far=so_far
+        )
+        write_result(setup.folder, scene, optimiser, setup.monitor, evaluation, report, so_far)
         raise
     remember_rates(setup.recipe.device.type, setup.recipe.threads, setup.monitor.forecast.measured(TELLING_S))
     return report
@@ -240,7 +261,7 @@ def _photo_counter(count: int, setup: _Setup) -> Callable[[int], None]:
     return lambda done: watch(f"reading {count} photos: {10 * (10 * done // count)} %")
 
 
-def _first_step(scene: Scene, origin: RunOrigin, setup: _Setup, observer: Observer | None) -> TwoStages:
+def _first_step(scene: Scene, origin: RunOrigin, setup: _Setup, observer: Observer) -> TwoStages:
     """The stages before their first step, or where earlier work ended."""
     recipe = stage_lengths(scene.start, setup.asked, setup.recipe)
     setup.monitor.report(
@@ -251,13 +272,15 @@ def _first_step(scene: Scene, origin: RunOrigin, setup: _Setup, observer: Observ
             reusable=reusable_seeding(setup.folder.path) if setup.earlier is None else {},
         )
     )
-    observer = replace(observer or Observer(), write_preview=partial(write_preview, setup.folder))
     optimiser = first_step(scene, recipe)
-    stages = TwoStages(optimiser, scene, setup.folder.path, origin, setup.monitor, observer)
+    repair = LostCameraRepair(optimiser, OwnMatches.of(scene))
+    run = RunState(setup.folder.path, scene, origin, setup.monitor)
+    preview = partial(write_preview, setup.folder, scene, optimiser, repair, run)
+    stages = TwoStages(optimiser, repair, run, observer.at_check, preview)
     if setup.earlier is not None:
         stages.restore(setup.earlier)
         # A partial result may hold these poses: they were measured after the checkpoint was written.
-        poses_so_far(stages)
+        poses_so_far(scene, optimiser, run)
         setup.monitor.report(Progress(stage="preparing", message=f"resuming at step {optimiser.step_index}"))
-    expect_rest(stages)
+    expect_rest(scene, optimiser, run)
     return stages

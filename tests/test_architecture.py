@@ -239,6 +239,21 @@ def test_a_write_into_another_object_is_found(code):
     assert foreign_writes("self.ends = 1; found = 2; table[0] = 3; self.sums[0] = 4") == []
 
 
+def test_only_what_runs_the_stages_is_given_them():
+    """All else takes what it needs of the scene, the optimiser and the run's state."""
+    given = {
+        node.name
+        for path in OF_A_RUN
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.FunctionDef)
+        and any(
+            arg.annotation is not None and "TwoStages" in ast.unparse(arg.annotation)
+            for arg in node.args.args
+        )
+    }
+    assert given == {"run_rounds"}
+
+
 def test_no_module_of_the_method_imports_another_for_its_types_alone():
     """Such imports hide circles from the contracts."""
     hidden = [

@@ -20,7 +20,6 @@ ALONE = (
 OFFCUTS = {
     "biresnerf/options/validated_options.py",  # refuses words; `refine_options` declares, and nothing else
     "biresnerf/refinement/parameters/ring_parameters.py",
-    "biresnerf/refinement/stages/timing.py",
 }
 DRAWERS = {"utils", "helpers", "common", "core", "misc"}
 SOURCES = [

@@ -22,12 +22,12 @@ from biresnerf.data.model.dataset import Dataset
 from biresnerf.errors import Interrupted
 from biresnerf.geometry.pose_error import PoseError, camera_errors, pose_error
 from biresnerf.geometry.similarity import align_by_spread, align_robust
-from biresnerf.pipeline import refine_poses
+from biresnerf.pipeline import Observer, refine_poses
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.method_changes import changed
 from biresnerf.refinement.optimise.methods import find_method
+from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.checkpoint import CHECKPOINT
-from biresnerf.refinement.stages.two_stages import Observer, TwoStages
 from biresnerf.refinement.views.image_metrics import psnr, ssim
 from biresnerf.report import Report
 from biresnerf.studies.cell import (
@@ -82,15 +82,15 @@ class TruthObserver:
             "centre": float(errors.centre.mean()),
         }
 
-    def at_end(self, stages: TwoStages) -> None:
-        matched = stages.scene.start.matched_poses
+    def at_end(self, scene: Scene, optimiser: JointOptimiser) -> None:
+        matched = scene.start.matched_poses
         if matched is not None:
-            self.matched = matched_error(matched, stages.scene.dataset.world_from_cam, self.truth)
-        self.depth_error = depth_error(stages.optimiser, stages.scene, self.truth)
+            self.matched = matched_error(matched, scene.dataset.world_from_cam, self.truth)
+        self.depth_error = depth_error(optimiser, scene, self.truth)
         if self.test_views is None:
             return
         started = time.monotonic()
-        views = list(render_test_views(stages.optimiser, self.test_views, self.truth))
+        views = list(render_test_views(optimiser, self.test_views, self.truth))
         pairs = [(view.render, view.photo) for view in views]
         masked = [(view.render, view.photo, view.counts) for view in views]
         distances, absent = _perceptual(pairs)

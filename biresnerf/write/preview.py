@@ -19,7 +19,10 @@ from biresnerf.data.workload import matching_work
 from biresnerf.forecast.run_forecast import Phase
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.progress import Monitor, Progress
-from biresnerf.refinement.stages.two_stages import TwoStages
+from biresnerf.refinement.lost.lost_cameras import LostCameraRepair
+from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.scene.scene import Scene
+from biresnerf.refinement.stages.run_state import RunState
 from biresnerf.refinement.verdict.run_report import run_report
 from biresnerf.refinement.verdict.so_far import poses_so_far
 from biresnerf.refinement.views.evaluation import render_view
@@ -30,27 +33,28 @@ TRANSFORMS = "transforms.json"
 PHASES: tuple[Phase, ...] = ("features", "matching", "mapping")  # of seeding
 
 
-def write_preview(folder: OutputFolder, stages: TwoStages) -> tuple[str, ...]:
+def write_preview(
+    folder: OutputFolder, scene: Scene, optimiser: JointOptimiser, repair: LostCameraRepair, run: RunState
+) -> tuple[str, ...]:
     """Write the best poses so far, the report on them, and one view as the field is now, at half the working size.
 
     Returns the files, relative to the output folder.
     """
-    path, so_far = folder.preview, poses_so_far(stages)
-    report = run_report(stages, [], None, "partial", so_far=so_far)
-    world_from_cam, dataset = so_far.offered(stages.scene)
+    path, so_far = folder.preview, poses_so_far(scene, optimiser, run)
+    report = run_report(scene, optimiser, run.record, repair.repaired, [], None, so_far=so_far)
+    world_from_cam, dataset = so_far.offered(scene)
     write_transforms(dataset, world_from_cam, path / TRANSFORMS)
     write_poses_json(described(dataset, world_from_cam, report), path / POSES)
     write_text(path / REPORT, report.model_dump_json(indent=2))
     names = [POSES, REPORT, TRANSFORMS]
-    if stages.history.path.is_file():
-        write_text(path / HISTORY, stages.history.path.read_text("utf-8").rstrip("\n"))
+    if run.history.path.is_file():
+        write_text(path / HISTORY, run.history.path.read_text("utf-8").rstrip("\n"))
         names.append(HISTORY)
-    return tuple(f"{PREVIEW}/{name}" for name in (*names, *_write_pictures(folder, stages)))
+    return tuple(f"{PREVIEW}/{name}" for name in (*names, *_write_pictures(folder, scene, optimiser)))
 
 
-def _write_pictures(folder: OutputFolder, stages: TwoStages) -> list[str]:
+def _write_pictures(folder: OutputFolder, scene: Scene, optimiser: JointOptimiser) -> list[str]:
     """Names of the pictures of one view, held out where there is one, and of its thumbnail."""
-    scene, optimiser = stages.scene, stages.optimiser
     view = (scene.held_out or [0])[0]
     halves = [
         camera.resized(max(1, camera.width // 2), max(1, camera.height // 2))

@@ -23,8 +23,8 @@ from biresnerf.data.show.view_file import THUMBNAIL, ShownPictures, ShownView, V
 from biresnerf.data.show.view_pictures import write_contact_sheet, write_points, write_thumbnail
 from biresnerf.geometry.similarity import Similarity
 from biresnerf.progress import Monitor, Progress
+from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.scene.scene import Scene
-from biresnerf.refinement.stages.two_stages import TwoStages
 from biresnerf.refinement.start.refined_poses import RefinedPoses
 from biresnerf.refinement.verdict.evaluate import Evaluation
 from biresnerf.refinement.verdict.so_far import SoFar
@@ -43,7 +43,9 @@ SOLID = 0.5  # opacity from which a depth means something
 
 def write_result(
     folder: OutputFolder,
-    stages: TwoStages,
+    scene: Scene,
+    optimiser: JointOptimiser,
+    monitor: Monitor,
     evaluation: Evaluation,
     report: Report,
     so_far: SoFar | None = None,
@@ -63,8 +65,8 @@ def write_result(
     """
     complete = report.state == "complete"
     if complete:
-        stages.monitor.report(Progress(stage="exporting"))
-    scene, optimiser, path = stages.scene, stages.optimiser, folder.path
+        monitor.report(Progress(stage="exporting"))
+    path = folder.path
     write_text(path / CONFIG, optimiser.options.model_dump_json(indent=2))
     found = so_far.refined if so_far is not None else RefinedPoses.now(scene.dataset, optimiser)
     refined, refined_dataset = found.world_from_cam, found.dataset
@@ -82,7 +84,7 @@ def write_result(
             _, moved = _write_poses(path / REFINED, scene, refined_dataset, refined, of_refined, field)
             poses = f"{REFINED}/{POSES}"
     # A run that is stopped must end soon: it leaves large exports out.
-    exports, monitor = (optimiser.options.exports, stages.monitor) if complete else ((), Monitor())
+    exports, watching = (optimiser.options.exports, monitor) if complete else ((), Monitor())
     finite = np.isfinite(returned).all()
     reference = write_georeference(returned_dataset, returned, path) if finite else None
     control = control_report(returned_dataset, returned) if finite else None
@@ -91,7 +93,7 @@ def write_result(
     report = report.model_copy(
         update={"geo_reference": reference, "control_points": control, "known_scale": scale}
     )
-    report, result = _write_poses(path, scene, returned_dataset, returned, report, field, exports, monitor)
+    report, result = _write_poses(path, scene, returned_dataset, returned, report, field, exports, watching)
     _write_view_file(path, scene, evaluation, moved or result, surface, poses)
     doubts = tuple(each.doubt for each in (reference, control) if each is not None and each.doubt)
     report = report.model_copy(update={"warnings": (*report.warnings, *doubts)})
@@ -102,7 +104,7 @@ def write_result(
     write_text(path / REPORT, report.model_dump_json(indent=2))
     if complete:
         folder.clean_up(failed=bool(report.faults))
-        stages.monitor.report_end(optimiser.schedule.steps)
+        monitor.report_end(optimiser.schedule.steps)
     return report
 
 

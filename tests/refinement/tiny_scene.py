@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +15,17 @@ from biresnerf.data.points.tracks import Tracks
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.data.synthetic.scene import write_synthetic_scene
 from biresnerf.errors import Interrupted
+from biresnerf.forecast.run_forecast import Forecast
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
+from biresnerf.progress import Monitor
+from biresnerf.refinement.lost.lost_cameras import LostCameraRepair
+from biresnerf.refinement.lost.own_matches import OwnMatches
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.methods import Method, Recipe
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.scene.scene_frame import scene_frame
+from biresnerf.refinement.stages.checkpoint import RunOrigin
+from biresnerf.refinement.stages.run_state import RunState
 from biresnerf.refinement.stages.two_stages import TwoStages
 
 CPU = torch.device("cpu")
@@ -102,11 +109,40 @@ def true_matches(dataset: Dataset, noise_px: float = 0.1) -> Tracks:
     return tracks
 
 
-def finished(stages: TwoStages) -> bool:
+class TinyRun:
+    """The parts of a run, as the pipeline makes them."""
+
+    def __init__(
+        self,
+        optimiser: JointOptimiser,
+        scene: Scene,
+        folder: Path,
+        monitor: Monitor | None = None,
+        **watching,
+    ) -> None:
+        self.optimiser, self.scene, self.folder = optimiser, scene, folder
+        self.state = RunState(folder, scene, RunOrigin(), monitor or Monitor())
+        self.repair = LostCameraRepair(optimiser, OwnMatches.of(scene))
+        self.stages = TwoStages(optimiser, self.repair, self.state, **watching)
+
+    @property
+    def parts(self) -> tuple[Scene, JointOptimiser, RunState]:
+        """As most functions take them."""
+        return self.scene, self.optimiser, self.state
+
+    @property
+    def forecast(self) -> Forecast:
+        return self.state.monitor.forecast
+
+    def end_in(self, seconds: float) -> None:
+        self.state.keep_to(self.state.replan, time.monotonic() + seconds)
+
+
+def finished(run: TinyRun) -> bool:
     """Run both stages; false if they were stopped."""
     try:
-        stages.run_stage_1()
-        stages.run_stage_2()
+        run.stages.run_stage_1()
+        run.stages.run_stage_2()
     except Interrupted:
         return False
     return True

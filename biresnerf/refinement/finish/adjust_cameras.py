@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from functools import partial
+
+import torch
 
 from biresnerf.refinement.finish.candidates import BY_PATCHES
 from biresnerf.refinement.finish.choose_poses import choose_poses
@@ -11,13 +12,19 @@ from biresnerf.refinement.finish.lens_evidence import corrected_cameras
 from biresnerf.refinement.finish.outcome import Finish
 from biresnerf.refinement.finish.photo_trial import photos_object
 from biresnerf.refinement.finish.work_ahead import adjustment
-from biresnerf.refinement.stages.two_stages import TwoStages
+from biresnerf.refinement.lost.lost_cameras import LostCameraRepair
+from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.scene.scene import Scene
+from biresnerf.refinement.stages.run_state import RunState
 from biresnerf.refinement.start.first_step import adjusts_cameras
+from biresnerf.refinement.views.compare_rigs import Rig
 
 logger = logging.getLogger(__name__)
 
 
-def adjust_cameras(stages: TwoStages, *, moves: bool = True) -> Finish:
+def adjust_cameras(
+    scene: Scene, optimiser: JointOptimiser, run: RunState, repair: LostCameraRepair, *, moves: bool = True
+) -> Finish:
     """Adjust all cameras at once, and where left-out evidence says that is better move them and hold them there.
 
     Cameras that their own matches contradict are placed by those first. Photos have the last word: nothing is moved
@@ -30,14 +37,18 @@ def adjust_cameras(stages: TwoStages, *, moves: bool = True) -> Finish:
     Raises:
         Interrupted: stopped; a continued run adjusts again.
     """
-    optimiser = stages.optimiser
-    if not adjusts_cameras(stages.scene.dataset, optimiser.method):
+    if not adjusts_cameras(scene.dataset, optimiser.method):
         return Finish()
     certainty = optimiser.lenses.certainty
-    with stages.timed("adjusting", amount=adjustment(stages.scene)):
+
+    def announce() -> None:
+        run.monitor.raise_if_stopped("stopped while the cameras were adjusted; run again to go on")
+        run.announce("adjusting all cameras at once")
+
+    with run.timed("adjusting", amount=adjustment(scene)):
         if moves:
-            stages.repair.place_by_matches()
-        found = choose_poses(stages.scene, optimiser, partial(_announce, stages))
+            repair.place_by_matches()
+        found = choose_poses(scene, optimiser, announce)
     if found is None:
         return Finish()
     chosen, finish, focals = found
@@ -45,23 +56,19 @@ def adjust_cameras(stages: TwoStages, *, moves: bool = True) -> Finish:
     if not moves:
         return finish
     if finish.heeds_photos:
-        stages.forecast.expect({"adjusting": 0.0})  # unless photos object
-    cameras, lenses = optimiser.lenses.refined(stages.scene.dataset).cameras, chosen.lenses
+        run.monitor.forecast.expect({"adjusting": 0.0})  # unless photos object
+    cameras, lenses = optimiser.lenses.refined(scene.dataset).cameras, chosen.lenses
     if lenses is not None:
         cameras = corrected_cameras(cameras, lenses.correction) or cameras
     asked = chosen.name not in ("refined", *BY_PATCHES)
-    if asked and photos_object(stages, chosen.world_from_cam, cameras):
+    rig = Rig(chosen.world_from_cam, tuple(cameras[frame.camera] for frame in scene.dataset.frames))
+    if asked and photos_object(scene, optimiser, run, rig):
         logger.info("the photos contradict these poses, which are not taken")
         optimiser.lenses.be_certain(certainty)
         return finish.refused()
     if chosen.name != "refined":
-        stages.place(chosen.world_from_cam)
+        optimiser.poses.place(torch.from_numpy(chosen.world_from_cam))
         optimiser.hold_poses()
     if lenses is not None:
-        optimiser.lenses.place(stages.scene.dataset.cameras, cameras)
+        optimiser.lenses.place(scene.dataset.cameras, cameras)
     return finish
-
-
-def _announce(stages: TwoStages) -> None:
-    stages.monitor.raise_if_stopped("stopped while the cameras were adjusted; run again to go on")
-    stages.announce("adjusting all cameras at once")

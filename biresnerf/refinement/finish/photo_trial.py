@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from biresnerf.data.workload import PHOTO_TRIALS, photo_check
-from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.similarity import align_robust
-from biresnerf.refinement.stages.two_stages import TwoStages
+from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.scene.scene import Scene
+from biresnerf.refinement.stages.run_state import RunState
 from biresnerf.refinement.views.compare_rigs import Effort, Rig, compare_placed
 from biresnerf.refinement.views.motion import moved_px
 
@@ -21,13 +20,12 @@ logger = logging.getLogger(__name__)
 UNSEEN_PX = 0.5
 
 
-def photos_will_be_asked(stages: TwoStages) -> bool:
+def photos_will_be_asked(scene: Scene, optimiser: JointOptimiser) -> bool:
     """Whether photos will have to judge the adjusted cameras, as far as the present poses tell.
 
     Cameras that are adjusted to tracks end near those that matches placed: where the present ones are as near, photos
     do not tell them apart. Unknown is yes.
     """
-    scene, optimiser = stages.scene, stages.optimiser
     matched, present = scene.start.matched_poses, optimiser.poses.poses().numpy()
     if matched is None or not (np.isfinite(matched).all() and np.isfinite(present).all()):
         return True
@@ -36,34 +34,30 @@ def photos_will_be_asked(stages: TwoStages) -> bool:
     return moved_px(Rig(present, lenses), Rig(carried, lenses), scene.images) >= UNSEEN_PX
 
 
-def photos_object(stages: TwoStages, unit_from_cam: NDArray[np.float64], cameras: Sequence[Camera]) -> bool:
-    """Whether fields trained at other poses [n, 4, 4] predict unseen views less well than at the present ones.
+def photos_object(scene: Scene, optimiser: JointOptimiser, run: RunState, other: Rig) -> bool:
+    """Whether fields trained at other poses predict unseen views less well than at the present ones.
 
     The feature matches of a symmetric thing may agree on poses that are wrong. SSIM has no say: small photos like poses
     that were fitted to them better than true ones. Nothing is trained where the poses are too near for photos to tell.
 
-    Args:
-        cameras: of the dataset, that the other poses see through.
-
     Raises:
         Interrupted: stopped.
     """
-    scene, optimiser = stages.scene, stages.optimiser
     refined = optimiser.lenses.refined(scene.dataset)
     present = Rig(optimiser.poses.poses().numpy(), tuple(refined.camera_of(i) for i in range(len(refined))))
-    other = Rig(unit_from_cam, tuple(cameras[frame.camera] for frame in refined.frames))
     moved = moved_px(present, other, scene.images)
     if moved < UNSEEN_PX:
         logger.info("the adjusted cameras moved by %.2f px, which photos do not show", moved)
         return False
-    stages.announce("checking the adjusted cameras by the photos")
+    run.announce("checking the adjusted cameras by the photos")
     work = photo_check(optimiser.options, unbounded=optimiser.frame.unbounded)  # known by now, if not before
-    with stages.timed("adjusting", "checking", work):
+    forecast = run.monitor.forecast
+    with run.timed("adjusting", "checking", work):
         found = compare_placed(
-            present, other, scene, optimiser, ~scene.start.guessed, stages.monitor.should_stop,
-            stages.forecast.advance, Effort(PHOTO_TRIALS, rounds_most=1, looks=(1.0,)),
+            present, other, scene, optimiser, ~scene.start.guessed, run.monitor.should_stop,
+            forecast.advance, Effort(PHOTO_TRIALS, rounds_most=1, looks=(1.0,)),
         )  # fmt: skip
-        stages.forecast.took(found.work if found else 0.0)
+        forecast.took(found.work if found else 0.0)
     if found is None:
         return False
     psnr = found.evidence.psnr

@@ -6,6 +6,7 @@ The tensors are the file's tensors; all else is the JSON of `Checkpoint` in its 
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -16,14 +17,13 @@ from torch import Tensor
 
 from biresnerf.data.model.atomic_file import whole_file
 from biresnerf.data.points.tracks import KEPT, Tracks
-from biresnerf.data.seeding.initial_poses import InitialPoses
+from biresnerf.data.seeding.initial_poses import InitialPoses, PoseArray
 from biresnerf.errors import InputError
 from biresnerf.frozen_model import FrozenModel
 from biresnerf.refinement.lost.lost_cameras import RepairState
 from biresnerf.refinement.optimise.optimiser_state import StepState
-from biresnerf.refinement.stages.best_so_far import BestSoFar
 from biresnerf.refinement.stages.stability import DetectorState
-from biresnerf.report import CandidateReport, SwitchReason
+from biresnerf.report import CandidateReport, SwitchReason, Verdict
 
 CHECKPOINT = Path("checkpoint") / "latest.safetensors"
 SEEDING = CHECKPOINT.with_name("seeding.json")  # COLMAP's result; every checkpoint carries a copy
@@ -46,6 +46,23 @@ class RunOrigin(FrozenModel, arbitrary_types_allowed=True):
     fingerprint: str = ""
     stage_1_fingerprint: str = ""
     seeding: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class BestSoFar:
+    """Poses and lenses of one moment, and what was found of them. `verdict.so_far` chooses them.
+
+    Attributes:
+        unit_from_cam: float64 [n, 4, 4], in the optimisation's frame.
+        increments: of the lenses, float64 [cameras, columns].
+        verdict: on these poses.
+        gain: the most that any poses were found to gain on the input's, log2 of the matches' error.
+    """
+
+    unit_from_cam: PoseArray
+    increments: PoseArray
+    verdict: Verdict
+    gain: float
 
 
 class RunRecord(FrozenModel, arbitrary_types_allowed=True):

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
@@ -24,7 +22,7 @@ from biresnerf.refinement.finish.outcome import Finish
 from biresnerf.refinement.lost.own_matches import contradicted
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.scene.scene import Scene
-from biresnerf.refinement.stages.two_stages import TwoStages
+from biresnerf.refinement.stages.run_state import RunState
 from biresnerf.refinement.start.refined_poses import RefinedPoses
 from biresnerf.refinement.verdict import image_flags
 from biresnerf.refinement.verdict.pose_evidence import compare_on_matches, errors_px, working_share
@@ -83,7 +81,7 @@ class Judgement:
     errors: ExpectedErrors | None = None
 
 
-def judge(stages: TwoStages, finish: Finish) -> Judgement | None:
+def judge(scene: Scene, optimiser: JointOptimiser, run: RunState, finish: Finish) -> Judgement | None:
     """The verdict on the refined poses; None where the options ask for none.
 
     Args:
@@ -92,42 +90,28 @@ def judge(stages: TwoStages, finish: Finish) -> Judgement | None:
     Raises:
         Interrupted: stopped; a continued run judges again.
     """
-    if not stages.optimiser.options.verdict:
+    if not optimiser.options.verdict:
         return None
-    message = "comparing the refined poses with the input's"
-    with stages.timed("judging"):
-        judgement = judge_poses(
-            stages.scene, stages.optimiser, stages.monitor.should_stop,
-            lambda share: stages.report_evaluation(share, message=message), partial(_rounds, stages),
-            lambda work: stages.forecast.took(JUDGING + work), finish,
-        )  # fmt: skip
+    with run.timed("judging"):
+        judgement = judge_poses(scene, optimiser, run, finish)
     logger.info("verdict: %s", judgement.verdict.verdict)
     return judgement
 
 
-def _rounds(stages: TwoStages, times: int) -> int:
+def _rounds(run: RunState, times: int) -> int:
     """How many rounds of trainings of `times` the usual length there is time for."""
-    each_s = times * stages.forecast.seconds("judging")
-    return int(min(max((stages.ends - time.monotonic()) / max(each_s, 1e-9), 0), ROUNDS_MOST))
+    each_s = times * run.monitor.forecast.seconds("judging")
+    return int(min(max(run.left_s / max(each_s, 1e-9), 0), ROUNDS_MOST))
 
 
 def judge_poses(
-    scene: Scene,
-    optimiser: JointOptimiser,
-    should_stop: Callable[[], bool] = lambda: False,
-    report: Callable[[float], None] = lambda _share: None,
-    rounds_in_time: Callable[[int], int] = lambda _times: ROUNDS_MOST,
-    took: Callable[[float], None] = lambda _work: None,
-    finish: Finish = Finish(),
+    scene: Scene, optimiser: JointOptimiser, run: RunState, finish: Finish = Finish()
 ) -> Judgement:
-    """Compare the optimised poses with the dataset's own; `report` is called with the share of work done.
+    """Compare the optimised poses with the dataset's own, as `judge` does.
 
-    `rounds_in_time` says in how many rounds fields may be trained, so many times as long as usual; they are trained in
-    one of the usual length in any case. `took` is called with the work that it was.
-
-    Raises:
-        Interrupted: ``should_stop`` returned true.
+    Fields are trained in as many rounds as there is time for, and in one of the usual length in any case.
     """
+    report = partial(run.report_evaluation, message="comparing the refined poses with the input's")
     report(0.0)
     refined = RefinedPoses.now(scene.dataset, optimiser)
     lost = int(optimiser.camera_errors.lost.sum())
@@ -139,19 +123,19 @@ def judge_poses(
     work = 0.0
     if told.moved_px >= MEASURABLE_PX:
         effort = Effort(pictured=True, favoured=told.favoured_by_matches, moved_px=told.moved_px)
-        rounds = max(rounds_in_time(1), 1)
+        rounds = max(_rounds(run, 1), 1)
         for each in (effort, replace(effort, times=LONGER, looks=(1.0,))):
             heldout = compare_placed(
-                found.before, found.after, scene, optimiser, found.placed | (not told.grounded), should_stop,
-                report, replace(each, rounds_most=rounds),
+                found.before, found.after, scene, optimiser, found.placed | (not told.grounded),
+                run.monitor.should_stop, report, replace(each, rounds_most=rounds),
             )  # fmt: skip
             work += heldout.work if heldout else 0.0
             blur = each is effort and heldout is not None and may_be_blur(heldout.evidence, effort)
-            rounds = rounds_in_time(LONGER) if blur else 0
+            rounds = _rounds(run, LONGER) if blur else 0
             if not rounds:
                 told = replace(told, may_be_blur=blur)
                 break
-    took(work)
+    run.monitor.forecast.took(JUDGING + work)
     verdict = decide(replace(told, heldout=heldout.evidence if heldout else None))
     return replace(_with_images(verdict, scene, optimiser, found, heldout), errors=errors)
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from biresnerf.data.model.dataset import Dataset
 from biresnerf.geometry.focus import focus_point, rms_spread
 from biresnerf.refinement.finish.expected_errors import ExpectedErrors
 from biresnerf.refinement.finish.outcome import Finish
 from biresnerf.refinement.lost.own_matches import contradicted
-from biresnerf.refinement.stages.two_stages import TwoStages
+from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.start.refined_poses import RefinedPoses
 from biresnerf.refinement.verdict.judgement import Judgement
 from biresnerf.uncertainty import KnownFrom, PoseUncertainty
@@ -21,7 +22,7 @@ OPEN = "their matches do not determine them"
 
 
 def pose_uncertainty(
-    stages: TwoStages, finish: Finish, judgement: Judgement | None
+    dataset: Dataset, optimiser: JointOptimiser, finish: Finish, judgement: Judgement | None
 ) -> tuple[PoseUncertainty, ...]:
     """Of each image's returned pose; of none where the method tells none.
 
@@ -29,7 +30,6 @@ def pose_uncertainty(
         finish: with the poses that fit all evidence that is to be trusted.
         judgement: None where there is no verdict, and the refined poses are returned.
     """
-    optimiser, dataset = stages.optimiser, stages.scene.dataset
     if not optimiser.method.uncertainty:
         return ()
     refined = RefinedPoses.now(dataset, optimiser)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Collection
 
 import numpy as np
 import torch
@@ -14,14 +14,14 @@ from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.field.backends import gpu_faults
 from biresnerf.refinement.finish.given_poses import accuracy_report, accuracy_warnings
 from biresnerf.refinement.finish.outcome import Finish
-from biresnerf.refinement.finish.time_budget import budget_warnings
+from biresnerf.refinement.finish.work_ahead import budget_warnings
 from biresnerf.refinement.lost.own_matches import LEAST_PAIRS
 from biresnerf.refinement.optimise.device_memory import smaller_batches
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.method_changes import method_warnings
 from biresnerf.refinement.parameters.intrinsics_parameters import FocalCertainty, IntrinsicsParameters
 from biresnerf.refinement.scene.scene import Scene
-from biresnerf.refinement.stages.two_stages import TwoStages
+from biresnerf.refinement.stages.checkpoint import RunRecord
 from biresnerf.refinement.start.choose_start import MARGIN_DB
 from biresnerf.refinement.start.matches_explained import explained_from_one_place
 from biresnerf.refinement.start.refined_poses import RefinedPoses
@@ -37,40 +37,44 @@ ONE_PLACE = 0.9  # of the matches, within 0.3 % of the photo's long side
 
 
 def run_report(
-    stages: TwoStages,
+    scene: Scene,
+    optimiser: JointOptimiser,
+    record: RunRecord,
+    repaired: Collection[int],
     scores: list[ViewScore],
     judgement: Judgement | None,
-    state: Literal["complete", "partial"],
-    finish: Finish = Finish(),
+    finish: Finish | None = None,
     uncertainty: tuple[PoseUncertainty, ...] = (),
     so_far: SoFar | None = None,
 ) -> Report:
     """The report of a run as it is now.
 
     Args:
+        repaired: images whose pose was replaced.
         scores: of held-out views, as far as they are scored.
         judgement: None where there is no verdict.
-        finish: what came of the adjustment of all cameras.
+        finish: what came of the adjustment of all cameras; None as long as the run is not complete.
         uncertainty: of each image's returned pose, or nothing.
         so_far: what a run offers that has no verdict yet; the present poses if not given.
     """
     from biresnerf import __version__
 
-    scene, optimiser, record = stages.scene, stages.optimiser, stages.record
-    dataset = scene.dataset
+    dataset, given = scene.dataset, finish.given if finish is not None else None
     refined = so_far.refined if so_far is not None else RefinedPoses.now(dataset, optimiser)
     return Report(
         version=__version__,
-        state=state,
+        state="partial" if finish is None else "complete",
         options=optimiser.options,
         verdict=judgement.verdict if judgement is not None else None,
         verdict_so_far=so_far.verdict if so_far is not None else None,
-        images=_image_reports(stages, scores, judgement, refined.world_from_cam, uncertainty),
+        images=_image_reports(
+            scene, optimiser, repaired, scores, judgement, refined.world_from_cam, uncertainty
+        ),
         cameras=camera_reports(dataset, refined.lenses),
         heldout=held_out_report(optimiser, scores) if scores else None,
         start_trials=scene.start.trials,
-        candidates=finish.candidates,
-        input_accuracy=finish.given and accuracy_report(finish.given),
+        candidates=finish.candidates if finish is not None else (),
+        input_accuracy=given and accuracy_report(given),
         steps_done=optimiser.step_index,
         switch_step=optimiser.switch if optimiser.method.two_stages else None,
         switch_reason=record.switch_reason,
@@ -85,13 +89,13 @@ def run_report(
         warnings=dataset.warnings
         + focal_warnings(dataset, refined.lenses)
         + turntable_warnings(scene.start)
-        + accuracy_warnings(finish.given, optimiser.options)
+        + accuracy_warnings(given, optimiser.options)
         + unmatched_warnings(scene)
         + one_place_warnings(scene.tracks, refined)
         + method_warnings(optimiser.recipe)
         + gpu_warnings(optimiser.device)
         + smaller_batches(optimiser)
-        + budget_warnings(stages)
+        + budget_warnings(optimiser.options.time_budget_s, record.seconds)
         + _unknown_warnings(dataset, uncertainty),
     )
 
@@ -214,13 +218,14 @@ def _unknown_warnings(dataset: Dataset, uncertainty: tuple[PoseUncertainty, ...]
 
 
 def _image_reports(
-    stages: TwoStages,
+    scene: Scene,
+    optimiser: JointOptimiser,
+    repaired: Collection[int],
     scores: list[ViewScore],
     judgement: Judgement | None,
     refined: np.ndarray,
     uncertainty: tuple[PoseUncertainty, ...],
 ) -> tuple[ImageReport, ...]:
-    scene, optimiser, repaired = stages.scene, stages.optimiser, stages.repair.repaired
     exposures = optimiser.exposure.gains()
     turn, shift = motion(scene.dataset.world_from_cam, refined)
     scored = {score.image: score for score in scores}

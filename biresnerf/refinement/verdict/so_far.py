@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.refinement.finish.expected_errors import expected_errors
 from biresnerf.refinement.finish.gather_evidence import without_patches
+from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.scene.scene import Scene
-from biresnerf.refinement.stages.best_so_far import BestSoFar
-from biresnerf.refinement.stages.two_stages import TwoStages
+from biresnerf.refinement.stages.checkpoint import BestSoFar
+from biresnerf.refinement.stages.run_state import RunState
 from biresnerf.refinement.start.refined_poses import RefinedPoses
 from biresnerf.refinement.verdict.judgement import compare_without_training
 from biresnerf.refinement.verdict.verdict import EPIPOLAR_MATTERS, decide, matches_are_better
@@ -43,18 +44,17 @@ class SoFar:
         return self.refined.world_from_cam, self.refined.dataset
 
 
-def poses_so_far(stages: TwoStages) -> SoFar:
+def poses_so_far(scene: Scene, optimiser: JointOptimiser, run: RunState) -> SoFar:
     """Measure the present poses, keep them if they are the best, and return the best.
 
     The input's poses are the first candidate, and poses follow them that the verdict's rule returns. Later ones take
     their place unless matches say that they are worse than the best ever measured, by as much as matters. No field is
     trained for it: it takes as long as a few steps.
     """
-    scene, optimiser, best = stages.scene, stages.optimiser, stages.record.best
-    now = RefinedPoses.now(scene.dataset, optimiser)
+    best, now = run.record.best, RefinedPoses.now(scene.dataset, optimiser)
     if not optimiser.options.verdict:
         return SoFar(now, None)
-    verdict = _verdict(stages, now)
+    verdict = _verdict(scene, optimiser, now)
     gain = 0.0 if verdict.epipolar is None else verdict.epipolar.error_px.difference
     if verdict.returned == "refined" and (best is None or gain > best.gain - EPIPOLAR_MATTERS):
         best = BestSoFar(
@@ -63,7 +63,7 @@ def poses_so_far(stages: TwoStages) -> SoFar:
             verdict=verdict,
             gain=gain if best is None else max(gain, best.gain),
         )
-        stages.note(best=best)
+        run.note(best=best)
         return SoFar(now, verdict)
     if best is None:
         return SoFar(now, verdict)
@@ -71,23 +71,22 @@ def poses_so_far(stages: TwoStages) -> SoFar:
     return SoFar(RefinedPoses.at(scene.dataset, optimiser, best.unit_from_cam, increments), best.verdict)
 
 
-def _verdict(stages: TwoStages, refined: RefinedPoses) -> Verdict:
+def _verdict(scene: Scene, optimiser: JointOptimiser, refined: RefinedPoses) -> Verdict:
     """By all but unseen views; where nothing else speaks for or against them, refined poses are offered."""
-    lost = int(stages.optimiser.camera_errors.lost.sum())
-    findings = compare_without_training(stages.scene, refined, lost).findings
+    lost = int(optimiser.camera_errors.lost.sum())
+    findings = compare_without_training(scene, refined, lost).findings
     if matches_are_better(findings):
-        findings = replace(findings, determined=_determined(stages))
+        findings = replace(findings, determined=_determined(scene, optimiser))
     verdict = decide(findings)
     if findings.epipolar is not None or verdict.verdict != "inconclusive":
         return verdict
     return verdict.model_copy(update={"returned": "refined", "why": (UNMEASURED, *verdict.why)})
 
 
-def _determined(stages: TwoStages) -> float | None:
+def _determined(scene: Scene, optimiser: JointOptimiser) -> float | None:
     """The share of cameras whose present poses tracks determine; None where the method does not ask."""
-    optimiser = stages.optimiser
     if not optimiser.method.uncertainty:
         return None
     poses = optimiser.poses.poses().numpy()
-    evidence = without_patches(stages.scene, optimiser).fitted
+    evidence = without_patches(scene, optimiser).fitted
     return float(expected_errors(poses, poses, evidence, bodies=optimiser.bodies).known.mean())

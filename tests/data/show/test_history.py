@@ -7,38 +7,36 @@ import json
 from biresnerf.data.show.history import HISTORY, History, read_history
 from biresnerf.progress import Monitor
 from biresnerf.refinement.stages.checkpoint import load_checkpoint
-from biresnerf.refinement.stages.two_stages import Observer, TwoStages
-from tests.refinement.tiny_scene import finished, given_scene, tiny_optimiser, tiny_options, tiny_set
+from tests.refinement.tiny_scene import TinyRun, finished, given_scene, tiny_optimiser, tiny_options, tiny_set
 
 
 def test_each_check_leaves_a_line_and_a_continued_run_has_them_once(tmp_path):
     scene, options = tiny_set(tmp_path / "scene"), tiny_options()
 
-    def run(stop_at: int) -> TwoStages:
+    def run(stop_at: int) -> TinyRun:
         optimiser = tiny_optimiser(*scene, options)
-        observer = Observer(at_check=lambda now: {"observed": float(now.step_index)})
-        stages = TwoStages(
+        found = TinyRun(
             optimiser,
             given_scene(*scene),
             tmp_path,
-            monitor=Monitor(should_stop=lambda: optimiser.step_index >= stop_at),
-            observer=observer,
+            Monitor(should_stop=lambda: optimiser.step_index >= stop_at),
+            at_check=lambda now: {"observed": float(now.step_index)},
         )
         checkpoint = load_checkpoint(tmp_path)
         if checkpoint is not None:
-            stages.restore(checkpoint)
-        finished(stages)
-        return stages
+            found.stages.restore(checkpoint)
+        finished(found)
+        return found
 
     run(13)
     # As a kill leaves it: lines from after the checkpoint, the last one torn off.
     with (tmp_path / HISTORY).open("a") as file:
         file.write(json.dumps({"step": 15, "stage": "lost"}) + '\n{"step": 20, "sta')
-    stages = run(10_000)
+    whole = run(10_000)
     seen = read_history(tmp_path / HISTORY)
     assert [line["step"] for line in seen] == list(range(5, 41, 5))
     assert [line["stage"] for line in seen] == ["coarse"] * 4 + ["fine"] * 4
-    assert stages.optimiser.switch == 20
+    assert whole.optimiser.switch == 20
     assert all(line["observed"] == line["step"] for line in seen)
     assert all(line["reconstruction_rate"] == 0 for line in seen[:4])
     assert seen[-1]["reconstruction_rate"] > 0

@@ -20,10 +20,10 @@ from biresnerf.refinement.finish.photo_evidence import photo_patches
 from biresnerf.refinement.lost.lost_cameras import LostCameraRepair
 from biresnerf.refinement.lost.own_matches import OwnMatches
 from biresnerf.refinement.parameters.intrinsics_parameters import lenses_of
-from biresnerf.refinement.stages.two_stages import TwoStages
 from biresnerf.refinement.verdict.run_report import camera_reports, focal_warnings
+from biresnerf.refinement.views.compare_rigs import Rig
 from tests.refinement.adjustment.rig import disturbed, observed, rotation_errors_deg
-from tests.refinement.tiny_scene import given_scene, tiny_optimiser, tiny_options, tiny_set
+from tests.refinement.tiny_scene import TinyRun, given_scene, tiny_optimiser, tiny_options, tiny_set
 
 pytestmark = pytest.mark.slow
 
@@ -35,7 +35,7 @@ def generator():
     return np.random.default_rng(2)
 
 
-def stages(
+def begun(
     folder, rng, *, given=None, refined=0.01, noise_px=0.02, points=120, focal=1.0, centre=(0, 0), source="given"
 ):  # fmt: skip
     """A run whose poses ended off the truth by `refined` rad, with tracks of the full-size photos.
@@ -60,7 +60,11 @@ def stages(
     optimiser.lenses = lenses_of(dataset, images, "none", [], torch.device("cpu"))
     poses = optimiser.frame.unit_from_world.apply_to_poses(truth)
     optimiser.poses.place(torch.from_numpy(disturbed(poses, rng, refined, 2 * refined)))
-    return TwoStages(optimiser, scene, folder), truth
+    return TinyRun(optimiser, scene, folder), truth
+
+
+def adjusted(run):
+    return adjust_cameras(*run.parts, run.repair)
 
 
 def lenses(dataset):
@@ -72,9 +76,9 @@ def errors_deg(run, truth):
 
 
 def test_cameras_are_adjusted_where_tracks_left_out_prefer_it(tmp_path, rng):
-    run, truth = stages(tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3))
+    run, truth = begun(tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3))
     before = errors_deg(run, truth)
-    reports = adjust_cameras(run).candidates
+    reports = adjusted(run).candidates
     assert [report.name for report in reports if report.chosen] == ["adjusted-tracks"]
     assert errors_deg(run, truth).mean() < 0.2 * before.mean()
 
@@ -85,7 +89,7 @@ TRIPLES = RigidBodies(np.arange(VIEWS) // 3, np.zeros(VIEWS, np.bool_))
 
 @pytest.mark.parametrize("bodies", [FIXED, TRIPLES], ids=["fixed", "rigs"])
 def test_fixed_cameras_and_rigs_are_adjusted_within_what_is_held(tmp_path, rng, bodies):
-    run, truth = stages(tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3))
+    run, truth = begun(tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3))
     optimiser, truth = run.optimiser, run.optimiser.frame.unit_from_world.apply_to_poses(truth)
     optimiser.bodies = bodies
     start = optimiser.poses.poses().numpy()
@@ -94,7 +98,7 @@ def test_fixed_cameras_and_rigs_are_adjusted_within_what_is_held(tmp_path, rng, 
         start[group] = motion @ truth[group]
     start[bodies.fixed] = truth[bodies.fixed]
     optimiser.poses.place(torch.from_numpy(start))
-    assert [r.name for r in adjust_cameras(run).candidates if r.chosen] == ["adjusted-tracks"]
+    assert [r.name for r in adjusted(run).candidates if r.chosen] == ["adjusted-tracks"]
     found = optimiser.poses.poses().numpy()
     tie = bodies.input_from_optimised(found, truth)
     before, after = (camera_errors(tie.apply_to_poses(p), truth).rotation_deg for p in (start, found))
@@ -103,59 +107,59 @@ def test_fixed_cameras_and_rigs_are_adjusted_within_what_is_held(tmp_path, rng, 
 
 
 def test_true_poses_of_the_input_are_returned(tmp_path, rng):
-    run, truth = stages(tmp_path, rng)
-    assert [report.name for report in adjust_cameras(run).candidates if report.chosen] == ["input"]
+    run, truth = begun(tmp_path, rng)
+    assert [report.name for report in adjusted(run).candidates if report.chosen] == ["input"]
     assert errors_deg(run, truth).max() < 1e-4
 
 
 def test_refined_poses_stay_without_evidence(tmp_path, rng):
-    run, _ = stages(tmp_path, rng)
+    run, _ = begun(tmp_path, rng)
     run.scene = replace(run.scene, tracks=None)
     before = run.optimiser.poses.poses()
-    assert adjust_cameras(run).candidates == ()
+    assert adjusted(run).candidates == ()
     assert torch.equal(run.optimiser.poses.poses(), before)
 
 
 def test_refined_poses_stay_where_all_tracks_are_wrong(tmp_path, rng):
-    run, truth = stages(tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3))
+    run, truth = begun(tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3))
     tracks = run.scene.tracks
     run.scene = replace(run.scene, tracks=replace(tracks, xy=rng.uniform(0, 24, tracks.xy.shape)))
     before = errors_deg(run, truth)
-    adjust_cameras(run)
+    adjusted(run)
     assert errors_deg(run, truth).mean() < 1.5 * before.mean()
 
 
 def test_guessed_cameras_that_match_each_other_have_no_say(tmp_path, rng):
     """Like photos of another scene among those of a plain thing."""
-    run, _ = stages(tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3))
+    run, _ = begun(tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3))
     foreign = np.arange(VIEWS) >= 4
     run.scene = replace(run.scene, tracks=run.scene.tracks.where(foreign[run.scene.tracks.image]))
     believed = run.optimiser.poses.poses()
     run.optimiser.camera_errors.doubt(foreign)
-    assert adjust_cameras(run).candidates == ()
+    assert adjusted(run).candidates == ()
     assert torch.equal(run.optimiser.poses.poses(), believed)
 
 
 def test_methods_of_others_are_left_alone(tmp_path, rng):
-    run, _ = stages(tmp_path, rng)
+    run, _ = begun(tmp_path, rng)
     run.optimiser.method = replace(run.optimiser.method, adjustment=False)
-    assert adjust_cameras(run).candidates == ()
+    assert adjusted(run).candidates == ()
 
 
 def test_a_field_without_surface_gives_no_patches(tmp_path, rng):
-    run, _ = stages(tmp_path, rng)
+    run, _ = begun(tmp_path, rng)
     intrinsics = lenses(run.scene.dataset)
     assert photo_patches(run.scene, run.optimiser, intrinsics, intrinsics, np.ones(VIEWS, np.bool_)) is None
 
 
 def test_a_lost_camera_is_placed_by_its_matches_and_adjusted_with_the_others(tmp_path, rng):
-    run, truth = stages(
+    run, truth = begun(
         tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3), refined=0.002, points=400
     )
     away = run.optimiser.poses.poses()[4] @ torch.diag(torch.tensor([-1.0, 1, -1, 1], dtype=torch.float64))
     run.optimiser.poses.replace(4, away[:3].float())
     run.repair = LostCameraRepair(run.optimiser, OwnMatches.of(run.scene))
-    adjust_cameras(run)
+    adjusted(run)
     assert run.repair.repaired == [4]
     assert errors_deg(run, truth).max() < 0.5
 
@@ -167,11 +171,9 @@ def focal_ratio(run):
 
 
 def test_a_guessed_focal_length_is_found_with_the_poses(tmp_path, rng):
-    run, truth = stages(
-        tmp_path, rng, refined=0.01, points=400, focal=1.05, source="guessed", given=wild(rng)
-    )
+    run, truth = begun(tmp_path, rng, refined=0.01, points=400, focal=1.05, source="guessed", given=wild(rng))
     before = errors_deg(run, truth)
-    adjust_cameras(run)
+    adjusted(run)
     assert focal_ratio(run) == pytest.approx(1 / 1.05, rel=0.005)
     assert errors_deg(run, truth).mean() < 0.2 * before.mean()
     known = run.optimiser.lenses.certainty[0]
@@ -182,11 +184,11 @@ def test_a_guessed_focal_length_is_found_with_the_poses(tmp_path, rng):
 
 
 def test_an_unknown_principal_point_is_found_with_the_poses_and_nothing_else_is_freed(tmp_path, rng):
-    run, truth = stages(
+    run, truth = begun(
         tmp_path, rng, points=400, noise_px=0.004, centre=(0.02, -0.015), source="guessed", given=wild(rng)
     )
     before, true = run.scene.dataset.cameras[0], tiny_set(tmp_path / "again", VIEWS, 24)[0].cameras[0].full()
-    adjust_cameras(run)
+    adjusted(run)
     after = run.optimiser.lenses.refined(run.scene.dataset).cameras[0]
     assert after.model == before.model
     assert after.full().cx == pytest.approx(true.cx, abs=0.2 * abs(before.full().cx - true.cx))
@@ -195,14 +197,14 @@ def test_an_unknown_principal_point_is_found_with_the_poses_and_nothing_else_is_
 
 
 def test_a_principal_point_that_was_given_stays(tmp_path, rng):
-    run, _ = stages(tmp_path, rng, points=400, centre=(0.02, -0.015), given=wild(rng))
-    adjust_cameras(run)
+    run, _ = begun(tmp_path, rng, points=400, centre=(0.02, -0.015), given=wild(rng))
+    adjusted(run)
     assert run.optimiser.lenses.refined(run.scene.dataset).cameras == run.scene.dataset.cameras
 
 
 def test_a_given_focal_length_is_kept_and_warned_of_where_matches_contradict_it(tmp_path, rng):
-    run, _ = stages(tmp_path, rng, points=400, focal=1.06, given=wild(rng))
-    adjust_cameras(run)
+    run, _ = begun(tmp_path, rng, points=400, focal=1.06, given=wild(rng))
+    adjusted(run)
     assert focal_ratio(run) == 1.0
     assert run.optimiser.lenses.certainty[0].contradicts == pytest.approx(1 / 1.06, rel=0.005)
     (warning,) = focal_warnings(run.scene.dataset, run.optimiser.lenses)
@@ -210,8 +212,8 @@ def test_a_given_focal_length_is_kept_and_warned_of_where_matches_contradict_it(
 
 
 def test_a_right_focal_length_that_was_given_is_not_warned_of(tmp_path, rng):
-    run, _ = stages(tmp_path, rng, points=400, given=wild(rng))
-    adjust_cameras(run)
+    run, _ = begun(tmp_path, rng, points=400, given=wild(rng))
+    adjusted(run)
     assert run.optimiser.lenses.certainty[0].observable
     assert run.optimiser.lenses.certainty[0].contradicts is None
 
@@ -224,12 +226,12 @@ def wild(rng):
 @pytest.mark.parametrize(("refined", "name"), [(0.0002, "refined"), (0.04, "adjusted-tracks")])
 def test_tracks_that_share_their_errors_move_no_camera_within_their_accuracy(tmp_path, rng, refined, name):
     """All features of a photo lie half a noise level beside where they belong, also those left out."""
-    run, truth = stages(tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3), refined=refined)
+    run, truth = begun(tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3), refined=refined)
     tracks = observed(truth, rng.uniform(-0.5, 0.5, (400, 3)), lenses(run.scene.dataset), rng, 0.3)
     beside = rng.normal(0, 0.15, (VIEWS, 2))
     run.scene = replace(run.scene, tracks=replace(tracks, xy=tracks.xy + beside[tracks.image]))
     before = errors_deg(run, truth)
-    candidates = {each.name: each for each in adjust_cameras(run).candidates}
+    candidates = {each.name: each for each in adjusted(run).candidates}
     assert candidates["adjusted-tracks"].track_misfit < 0.9 * candidates["refined"].track_misfit
     assert [each.name for each in candidates.values() if each.chosen] == [name]
     if name == "refined":
@@ -238,23 +240,23 @@ def test_tracks_that_share_their_errors_move_no_camera_within_their_accuracy(tmp
 
 def test_tracks_that_judged_place_cameras_as_well_once_poses_are_chosen(tmp_path, rng):
     """The last camera sees none of the points that candidates are adjusted to."""
-    run, truth = stages(tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3))
+    run, truth = begun(tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3))
     tracks, last = run.scene.tracks, VIEWS - 1
     run.scene = replace(
         run.scene, tracks=tracks.where(tracks.left_out()[tracks.point] | (tracks.image != last))
     )
     before = errors_deg(run, truth)
-    assert [each.name for each in adjust_cameras(run).candidates if each.chosen] == ["adjusted-tracks"]
+    assert [each.name for each in adjusted(run).candidates if each.chosen] == ["adjusted-tracks"]
     assert errors_deg(run, truth)[last] < 0.2 * before.mean()
 
 
 def test_refined_poses_go_on_where_tracks_do_not_tell_them_from_the_input(tmp_path, rng):
     """The input fits them better, but the difference is within their accuracy: photos will tell."""
-    run, truth = stages(
+    run, truth = begun(
         tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.0002, 0.0004), refined=0.002, noise_px=0.3
     )
     before = errors_deg(run, truth)
-    candidates = {each.name: each for each in adjust_cameras(run).candidates}
+    candidates = {each.name: each for each in adjusted(run).candidates}
     assert candidates["input"].track_misfit < candidates["refined"].track_misfit
     assert [each.name for each in candidates.values() if each.chosen] == ["refined"]
     assert np.array_equal(errors_deg(run, truth), before)
@@ -265,18 +267,19 @@ def test_refined_poses_go_on_where_tracks_do_not_tell_them_from_the_input(tmp_pa
 def test_fields_are_trained_only_where_patches_of_the_photos_have_not_spoken(
     tmp_path, rng, monkeypatch, name
 ):
-    run, _ = stages(tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3))
+    run, _ = begun(tmp_path, rng, given=lambda poses: disturbed(poses, rng, 0.1, 0.3))
     adjust, asked = choose_poses.adjust, []
     monkeypatch.setattr(choose_poses, "adjust", lambda *given: {name: next(iter(adjust(*given).values()))})
     monkeypatch.setattr(module, "photos_object", lambda *_: bool(asked.append(name)))
-    (chosen,) = (each.name for each in adjust_cameras(run).candidates if each.chosen)
+    (chosen,) = (each.name for each in adjusted(run).candidates if each.chosen)
     assert chosen == name
     assert asked == (["adjusted-tracks"] if name == "adjusted-tracks" else [])
 
 
 def test_no_field_is_trained_where_cameras_moved_by_less_than_photos_show(tmp_path, rng, monkeypatch):
-    run, _ = stages(tmp_path, rng)
+    run, _ = begun(tmp_path, rng)
     present, trained = run.optimiser.poses.poses().numpy(), []
+    seen_by = tuple(run.scene.dataset.camera_of(i) for i in range(VIEWS))
     forecast = run.forecast
     monkeypatch.setattr(
         photo_trial,
@@ -286,14 +289,14 @@ def test_no_field_is_trained_where_cameras_moved_by_less_than_photos_show(tmp_pa
     work = photo_check(run.optimiser.options, unbounded=run.optimiser.frame.unbounded)
     for deviation, expected in ((1e-4, []), (0.1, [((1.0,), work)])):
         other = disturbed(present, rng, deviation, deviation)
-        assert not photo_trial.photos_object(run, other, run.scene.dataset.cameras)
+        assert not photo_trial.photos_object(*run.parts, Rig(other, seen_by))
         assert trained == expected, "and it is known how long that takes"
         assert not forecast.left.get("checking")
 
 
 def test_the_accuracy_of_the_input_is_measured_where_poses_were_given(tmp_path, rng):
-    run, _ = stages(tmp_path, rng, given=lambda truth: disturbed(truth, rng, 0.004, 0.02))
-    found = adjust_cameras(run).given
+    run, _ = begun(tmp_path, rng, given=lambda truth: disturbed(truth, rng, 0.004, 0.02))
+    found = adjusted(run).given
     assert found is not None
     report = accuracy_report(found)
     assert report.rotation_deg == pytest.approx(np.degrees(0.004), rel=0.4)
@@ -302,7 +305,7 @@ def test_the_accuracy_of_the_input_is_measured_where_poses_were_given(tmp_path, 
 
 
 def test_guessed_poses_have_no_accuracy(tmp_path, rng):
-    run, _ = stages(tmp_path, rng, given=wild(rng))
+    run, _ = begun(tmp_path, rng, given=wild(rng))
     guessed = tuple(replace(frame, pose_source="neighbours") for frame in run.scene.dataset.frames)
     run.scene = replace(run.scene, dataset=replace(run.scene.dataset, frames=guessed))
-    assert adjust_cameras(run).given is None
+    assert adjusted(run).given is None

@@ -7,11 +7,17 @@ import pytest
 
 from biresnerf.data.workload import FIRST_ROUND, LEARNING
 from biresnerf.forecast.run_forecast import RATES
-from biresnerf.refinement.finish.time_budget import LEAST, budget_warnings, choose_steps, keep_to_budget
-from biresnerf.refinement.finish.work_ahead import step_weights, work_ahead
+from biresnerf.refinement.finish.work_ahead import (
+    LEAST,
+    budget_warnings,
+    choose_steps,
+    keep_to_budget,
+    step_weights,
+    work_ahead,
+)
 from biresnerf.refinement.stages.checkpoint import load_checkpoint
-from biresnerf.refinement.stages.two_stages import MEASURED_STEPS, TwoStages
-from tests.refinement.tiny_scene import finished, given_scene, tiny_optimiser, tiny_options, tiny_set
+from biresnerf.refinement.stages.two_stages import MEASURED_STEPS
+from tests.refinement.tiny_scene import TinyRun, finished, given_scene, tiny_optimiser, tiny_options, tiny_set
 
 STEPS = 400
 
@@ -21,55 +27,55 @@ def scene(tmp_path_factory):
     return tiny_set(tmp_path_factory.mktemp("scene"))
 
 
-def stages_of(scene, folder, **changed):
+def begun(scene, folder, **changed):
     lengths = {"steps": STEPS, "coarse_steps_min": 100, "coarse_steps_max": 200, "verdict": False}
     options = tiny_options(**{**lengths, **changed})
-    return TwoStages(tiny_optimiser(*scene, options), given_scene(*scene), folder)
+    return TinyRun(tiny_optimiser(*scene, options), given_scene(*scene), folder)
 
 
-def with_step_of(stages, seconds):
+def with_step_of(run, seconds):
     """As if steps of stage 1 took so long, and those of stage 2 twice as long; all else nothing."""
-    weights = stages.forecast.step_weights = step_weights(stages.optimiser.options, unbounded=False)
-    stages.forecast.rates = dict.fromkeys(RATES, 0.0) | {
+    weights = run.forecast.step_weights = step_weights(run.optimiser.options, unbounded=False)
+    run.forecast.rates = dict.fromkeys(RATES, 0.0) | {
         "coarse step": seconds / weights["coarse"],
         "fine step": 2 * seconds / weights["fine"],
     }
-    return stages
+    return run
 
 
-def left_s(stages):
-    return stages.forecast.left_s(work_ahead(stages))
+def left_s(run):
+    return run.forecast.left_s(work_ahead(*run.parts))
 
 
 @pytest.mark.parametrize("seconds", [350.0, 450.0, 550.0])
 def test_as_many_steps_are_taken_as_there_is_time_for(scene, tmp_path, seconds):
-    stages = with_step_of(stages_of(scene, tmp_path), 1.0)
-    stages.ends = time.monotonic() + seconds
-    choose_steps(stages, STEPS)
-    assert LEAST * STEPS < stages.optimiser.schedule.steps < STEPS
-    assert left_s(stages) == pytest.approx(seconds, rel=0.02)
-    options = stages.optimiser.options
+    run = with_step_of(begun(scene, tmp_path), 1.0)
+    run.end_in(seconds)
+    choose_steps(*run.parts, STEPS)
+    assert LEAST * STEPS < run.optimiser.schedule.steps < STEPS
+    assert left_s(run) == pytest.approx(seconds, rel=0.02)
+    options = run.optimiser.options
     assert options.coarse_steps_max == pytest.approx(options.steps / 2, abs=1)
 
 
 def test_no_more_steps_are_taken_than_were_asked_for_and_no_fewer_than_a_tenth(scene, tmp_path):
-    stages = with_step_of(stages_of(scene, tmp_path), 1.0)
-    stages.ends = time.monotonic() + 1e6
-    choose_steps(stages, STEPS)
-    assert stages.optimiser.schedule.steps == STEPS
-    stages.ends = time.monotonic() - 1e6
-    choose_steps(stages, STEPS)
-    assert stages.optimiser.schedule.steps == round(LEAST * STEPS)
+    run = with_step_of(begun(scene, tmp_path), 1.0)
+    run.end_in(1e6)
+    choose_steps(*run.parts, STEPS)
+    assert run.optimiser.schedule.steps == STEPS
+    run.end_in(-1e6)
+    choose_steps(*run.parts, STEPS)
+    assert run.optimiser.schedule.steps == round(LEAST * STEPS)
 
 
 def test_steps_that_were_too_few_are_added_again_where_they_turn_out_faster(scene, tmp_path):
-    stages = with_step_of(stages_of(scene, tmp_path), 1.0)
-    stages.ends = time.monotonic() + 400
-    choose_steps(stages, STEPS)
-    few = stages.optimiser.schedule.steps
-    stages.optimiser.start_reconstruction()
-    choose_steps(with_step_of(stages, 0.7), STEPS)
-    assert few < stages.optimiser.schedule.steps < STEPS
+    run = with_step_of(begun(scene, tmp_path), 1.0)
+    run.end_in(400)
+    choose_steps(*run.parts, STEPS)
+    few = run.optimiser.schedule.steps
+    run.optimiser.start_reconstruction()
+    choose_steps(*with_step_of(run, 0.7).parts, STEPS)
+    assert few < run.optimiser.schedule.steps < STEPS
 
 
 @pytest.mark.parametrize(
@@ -78,32 +84,32 @@ def test_steps_that_were_too_few_are_added_again_where_they_turn_out_faster(scen
 def test_time_that_an_adjustment_leaves_goes_to_the_field_at_the_poses_it_found(
     scene, tmp_path, seconds, steps
 ):
-    stages = with_step_of(stages_of(scene, tmp_path), 1.0)
-    stages.ends = time.monotonic() + 100  # as far as was known before it
-    choose_steps(stages, STEPS)
-    few = stages.optimiser.schedule.steps
-    stages.optimiser.start_reconstruction()
-    stages.optimiser.poses_held = True
-    stages.record = stages.record.model_copy(update={"adjusted": True})
-    stages.optimiser.end_after(LEARNING)
-    assert stages.optimiser.schedule.steps < few
-    stages.ends = time.monotonic() + seconds
-    choose_steps(stages, STEPS)
-    found = stages.optimiser.schedule.steps
+    run = with_step_of(begun(scene, tmp_path), 1.0)
+    run.end_in(100)  # as far as was known before it
+    choose_steps(*run.parts, STEPS)
+    few = run.optimiser.schedule.steps
+    run.optimiser.start_reconstruction()
+    run.optimiser.poses_held = True
+    run.state.note(adjusted=True)
+    run.optimiser.end_after(LEARNING)
+    assert run.optimiser.schedule.steps < few
+    run.end_in(seconds)
+    choose_steps(*run.parts, STEPS)
+    found = run.optimiser.schedule.steps
     assert found > few
     if steps is None:
-        assert left_s(stages) == pytest.approx(seconds, rel=0.02)
+        assert left_s(run) == pytest.approx(seconds, rel=0.02)
     else:
         assert found == steps
 
 
 @pytest.mark.slow
 def test_a_run_is_planned_again_at_each_check_of_stage_2(scene, tmp_path):
-    stages = stages_of(scene, tmp_path, steps=120, coarse_steps_min=10, coarse_steps_max=20, check_every=10)
+    run = begun(scene, tmp_path, steps=120, coarse_steps_min=10, coarse_steps_max=20, check_every=10)
     planned = []
-    stages.keep_to(lambda found: planned.append(found.optimiser.step_index))
-    assert finished(stages)
-    switch = stages.optimiser.switch
+    run.state.keep_to(lambda: planned.append(run.optimiser.step_index))
+    assert finished(run)
+    switch = run.optimiser.switch
     due = {step for step in range(switch + 1, 121) if step % 10 == 0} | {
         MEASURED_STEPS,
         switch + MEASURED_STEPS,
@@ -113,39 +119,39 @@ def test_a_run_is_planned_again_at_each_check_of_stage_2(scene, tmp_path):
 
 @pytest.mark.slow
 def test_a_run_without_time_ends_early_and_says_what_it_took(scene, tmp_path):
-    stages = stages_of(scene, tmp_path, time_budget_s=0.01)
-    keep_to_budget(stages, time.monotonic(), STEPS)
-    assert finished(stages)
-    assert MEASURED_STEPS <= stages.optimiser.step_index == round(LEAST * STEPS)
-    (warning,) = budget_warnings(stages)
+    run = begun(scene, tmp_path, time_budget_s=0.01)
+    keep_to_budget(*run.parts, time.monotonic(), STEPS)
+    assert finished(run)
+    assert MEASURED_STEPS <= run.optimiser.step_index == round(LEAST * STEPS)
+    (warning,) = budget_warnings(run.optimiser.options.time_budget_s, run.state.record.seconds)
     assert "of a budget of 0.01 s" in warning
 
 
 @pytest.mark.slow
 def test_a_run_without_a_budget_takes_all_its_steps(scene, tmp_path):
-    stages = stages_of(scene, tmp_path, steps=60, coarse_steps_min=10, coarse_steps_max=20)
-    keep_to_budget(stages, time.monotonic(), 60)
-    assert (stages.ends, finished(stages)) == (math.inf, True)
-    assert stages.optimiser.step_index == 60
-    assert budget_warnings(stages) == ()
+    run = begun(scene, tmp_path, steps=60, coarse_steps_min=10, coarse_steps_max=20)
+    keep_to_budget(*run.parts, time.monotonic(), 60)
+    assert (run.state.ends, finished(run)) == (math.inf, True)
+    assert run.optimiser.step_index == 60
+    assert budget_warnings(run.optimiser.options.time_budget_s, run.state.record.seconds) == ()
 
 
 def test_time_before_an_interruption_counts_against_the_budget(scene, tmp_path):
-    stages = stages_of(scene, tmp_path, time_budget_s=200.0)
-    keep_to_budget(stages, 1000.0, STEPS)
-    whole = stages.ends
-    stages.record.seconds.update(preparing=20.0, coarse=30.0)
-    keep_to_budget(stages, 1000.0, STEPS)
-    assert stages.ends == pytest.approx(whole - 50.0)
+    run = begun(scene, tmp_path, time_budget_s=200.0)
+    keep_to_budget(*run.parts, 1000.0, STEPS)
+    whole = run.state.ends
+    run.state.record.seconds.update(preparing=20.0, coarse=30.0)
+    keep_to_budget(*run.parts, 1000.0, STEPS)
+    assert run.state.ends == pytest.approx(whole - 50.0)
 
 
 @pytest.mark.slow
 def test_a_resumed_run_keeps_the_lengths_that_were_chosen(scene, tmp_path):
-    stages = stages_of(scene, tmp_path, time_budget_s=0.01)
-    keep_to_budget(stages, time.monotonic(), STEPS)
-    assert finished(stages)
-    again = stages_of(scene, tmp_path, time_budget_s=0.01)
-    again.restore(load_checkpoint(tmp_path))
-    assert again.optimiser.options == stages.optimiser.options
-    assert again.optimiser.schedule == stages.optimiser.schedule
-    assert again.detector.cap == stages.optimiser.options.coarse_steps_max < 200
+    run = begun(scene, tmp_path, time_budget_s=0.01)
+    keep_to_budget(*run.parts, time.monotonic(), STEPS)
+    assert finished(run)
+    again = begun(scene, tmp_path, time_budget_s=0.01)
+    again.stages.restore(load_checkpoint(tmp_path))
+    assert again.optimiser.options == run.optimiser.options
+    assert again.optimiser.schedule == run.optimiser.schedule
+    assert again.stages.detector.cap == run.optimiser.options.coarse_steps_max < 200

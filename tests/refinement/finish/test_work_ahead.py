@@ -11,8 +11,14 @@ from biresnerf.forecast.run_forecast import Forecast
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.similarity import Similarity
 from biresnerf.refinement.finish.work_ahead import expect_as_measured, expect_rest, expect_run, work_ahead
-from biresnerf.refinement.stages.two_stages import TwoStages
-from tests.refinement.tiny_scene import given_scene, tiny_optimiser, tiny_options, tiny_recipe, tiny_set
+from tests.refinement.tiny_scene import (
+    TinyRun,
+    given_scene,
+    tiny_optimiser,
+    tiny_options,
+    tiny_recipe,
+    tiny_set,
+)
 
 TRACKS = Tracks.of(np.array([0, 0]), np.array([0, 1]), np.ones((2, 2)))
 
@@ -23,19 +29,19 @@ def scene(tmp_path_factory):
 
 
 @pytest.fixture
-def stages_of(scene, tmp_path):
-    def make(tracks=None, **options) -> TwoStages:
+def run_of(scene, tmp_path):
+    def make(tracks=None, **options) -> TinyRun:
         dataset, images = scene
         optimiser = tiny_optimiser(dataset, images, tiny_options(**options))
-        stages = TwoStages(optimiser, replace(given_scene(dataset, images), tracks=tracks), tmp_path)
-        expect_rest(stages)
-        return stages
+        run = TinyRun(optimiser, replace(given_scene(dataset, images), tracks=tracks), tmp_path)
+        expect_rest(*run.parts)
+        return run
 
     return make
 
 
-def test_with_tracks_fewer_steps_are_taken_and_adjusted_cameras_are_checked(stages_of):
-    short, long = stages_of(), stages_of(TRACKS)
+def test_with_tracks_fewer_steps_are_taken_and_adjusted_cameras_are_checked(run_of):
+    short, long = run_of(), run_of(TRACKS)
     assert (short.forecast.share, long.forecast.share) == (1.0, FIRST_ROUND + LEARNING)
     weight = step_weights(short.optimiser.options, unbounded=False)["fine"]
     assert short.forecast.left["fine"] == pytest.approx(20 * weight)
@@ -43,47 +49,47 @@ def test_with_tracks_fewer_steps_are_taken_and_adjusted_cameras_are_checked(stag
     assert short.forecast.left["checking"] == 0 < long.forecast.left["checking"]
 
 
-def test_what_was_adjusted_once_is_adjusted_once_more_and_not_checked_again(stages_of):
-    stages = stages_of(TRACKS)
-    before = work_ahead(stages)
-    stages.record = stages.record.model_copy(update={"adjusted": True})
-    after = work_ahead(stages)
+def test_what_was_adjusted_once_is_adjusted_once_more_and_not_checked_again(run_of):
+    run = run_of(TRACKS)
+    before = work_ahead(*run.parts)
+    run.state.note(adjusted=True)
+    after = work_ahead(*run.parts)
     assert after["adjusting"] == before["adjusting"] / 2
     assert after["checking"] == 0
-    stages.record = stages.record.model_copy(update={"adjusts_again": False})
-    assert work_ahead(stages)["adjusting"] == 0
+    run.state.note(adjusts_again=False)
+    assert work_ahead(*run.parts)["adjusting"] == 0
 
 
 @pytest.mark.parametrize(("off", "asked"), [(0.0, False), (0.1, True)])
-def test_photos_are_expected_to_judge_only_cameras_that_matches_would_move_visibly(stages_of, off, asked):
-    stages = stages_of(TRACKS)
-    present = stages.optimiser.poses.poses().numpy()
+def test_photos_are_expected_to_judge_only_cameras_that_matches_would_move_visibly(run_of, off, asked):
+    run = run_of(TRACKS)
+    present = run.optimiser.poses.poses().numpy()
     moved = perturb_poses(present, off, seed=1) if off else present
     # In another frame and scale than the run's own, as the user's are.
     turned = Similarity(
         2.0, np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([1.0, 2.0, 3.0])
     ).apply_to_poses(moved)
-    stages.scene = replace(stages.scene, start=replace(stages.scene.start, matched_poses=turned))
-    assert (work_ahead(stages)["checking"] > 0) == asked
-    expect_as_measured(stages)
-    assert (stages.forecast.left["checking"] > 0) == asked
+    run.scene = replace(run.scene, start=replace(run.scene.start, matched_poses=turned))
+    assert (work_ahead(*run.parts)["checking"] > 0) == asked
+    expect_as_measured(*run.parts)
+    assert (run.forecast.left["checking"] > 0) == asked
 
 
-def test_the_verdict_takes_time_only_where_it_is_asked_for(stages_of):
-    assert work_ahead(stages_of(verdict=False))["judging"] == 0
-    few, many = (work_ahead(stages_of(trial_steps=steps))["judging"] - JUDGING for steps in (50, 100))
+def test_the_verdict_takes_time_only_where_it_is_asked_for(run_of):
+    assert work_ahead(*run_of(verdict=False).parts)["judging"] == 0
+    few, many = (work_ahead(*run_of(trial_steps=steps).parts)["judging"] - JUDGING for steps in (50, 100))
     assert many > 0
     assert many == pytest.approx(2 * few)
 
 
-def test_methods_of_others_do_not_adjust(stages_of):
-    assert work_ahead(stages_of(method="biresnerf-paper"))["adjusting"] == 0
+def test_methods_of_others_do_not_adjust(run_of):
+    assert work_ahead(*run_of(method="biresnerf-paper").parts)["adjusting"] == 0
 
 
-def test_a_run_from_given_poses_is_known_before_its_first_step(scene, stages_of):
+def test_a_run_from_given_poses_is_known_before_its_first_step(scene, run_of):
     found = Forecast()
     expect_run(found, scene[0], tiny_recipe(start="given"))
-    assert found.left == pytest.approx(stages_of(start="given").forecast.left)
+    assert found.left == pytest.approx(run_of(start="given").forecast.left)
 
 
 def test_matching_is_expected_where_poses_are_compared_with_matches(scene):

@@ -22,13 +22,20 @@ from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.parameters.pose_parameters import PoseParameters
 from biresnerf.refinement.scene.scene_frame import scene_frame
 from biresnerf.refinement.stages.checkpoint import load_checkpoint
-from biresnerf.refinement.stages.two_stages import TwoStages
 from biresnerf.refinement.verdict.evaluate import Evaluation
 from biresnerf.refinement.verdict.pose_uncertainty import LOST, pose_uncertainty
 from biresnerf.refinement.verdict.run_report import run_report
 from biresnerf.write.output_folder import OutputFolder
 from biresnerf.write.result import write_result
-from tests.refinement.tiny_scene import CPU, finished, given_scene, tiny_optimiser, tiny_options, tiny_set
+from tests.refinement.tiny_scene import (
+    CPU,
+    TinyRun,
+    finished,
+    given_scene,
+    tiny_optimiser,
+    tiny_options,
+    tiny_set,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -49,7 +56,7 @@ def true_poses(scene: tuple[Dataset, ImageSet]) -> np.ndarray:
 
 def start(
     scene: tuple[Dataset, ImageSet], folder: Path, poses: np.ndarray, stop_at: int | None = None
-) -> TwoStages:
+) -> TinyRun:
     options = tiny_options(
         steps=STEPS,
         coarse_steps_min=96,
@@ -62,11 +69,11 @@ def start(
     optimiser = JointOptimiser(
         scene[1], scene_frame(scene[0].world_from_cam, scene[1]), poses, Recipe.of(options, CPU, 1), HELD_OUT
     )
-    return TwoStages(
+    return TinyRun(
         optimiser,
         given_scene(*scene, held_out=HELD_OUT),
         folder,
-        monitor=Monitor(should_stop=lambda: stop_at is not None and optimiser.step_index >= stop_at),
+        Monitor(should_stop=lambda: stop_at is not None and optimiser.step_index >= stop_at),
     )
 
 
@@ -80,8 +87,8 @@ def spoiled(poses: np.ndarray) -> np.ndarray:
     return poses
 
 
-def errors_deg(stages: TwoStages, truth: np.ndarray) -> np.ndarray:
-    now = stages.optimiser.poses.poses().numpy()
+def errors_deg(run: TinyRun, truth: np.ndarray) -> np.ndarray:
+    now = run.optimiser.poses.poses().numpy()
     return camera_errors(align_robust(now, truth).apply_to_poses(now), truth).rotation_deg
 
 
@@ -92,13 +99,13 @@ def budget_for_so_short_a_run(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def repaired(scene, tmp_path_factory) -> TwoStages:
+def repaired(scene, tmp_path_factory) -> TinyRun:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lost_cameras, "RUN_SHARE", 10.0)
         patch.setattr(lost_cameras, "EVENT_SHARE", 10.0)
-        stages = start(scene, tmp_path_factory.mktemp("repaired"), spoiled(true_poses(scene)))
-        assert finished(stages)
-    return stages
+        run = start(scene, tmp_path_factory.mktemp("repaired"), spoiled(true_poses(scene)))
+        assert finished(run)
+    return run
 
 
 def test_a_camera_half_turned_and_one_carried_far_round_come_home(scene, repaired):
@@ -117,12 +124,12 @@ def test_cameras_that_begin_at_a_guess_are_in_doubt_until_they_stand_right(scene
         apart = np.linalg.norm(truth[:, :3, 3] - truth[camera, :3, 3], axis=1)
         given[camera] = truth[np.argsort(apart)[2]]  # where another photo was taken
         guessed[camera] = True
-    stages = start(scene, tmp_path, given)
-    stages.optimiser.camera_errors.doubt(guessed)
-    assert errors_deg(stages, truth)[guessed].min() > 20
-    assert finished(stages)
-    assert errors_deg(stages, truth)[guessed].max() < 15
-    assert not stages.optimiser.camera_errors.lost.any()
+    run = start(scene, tmp_path, given)
+    run.optimiser.camera_errors.doubt(guessed)
+    assert errors_deg(run, truth)[guessed].min() > 20
+    assert finished(run)
+    assert errors_deg(run, truth)[guessed].max() < 15
+    assert not run.optimiser.camera_errors.lost.any()
 
 
 def test_a_run_stopped_between_repairs_ends_as_an_uninterrupted_one(scene, tmp_path, repaired):
@@ -130,7 +137,7 @@ def test_a_run_stopped_between_repairs_ends_as_an_uninterrupted_one(scene, tmp_p
     assert not finished(stopped)
     assert stopped.repair.repaired == [TURNED]
     resumed = start(scene, tmp_path, spoiled(true_poses(scene)))
-    resumed.restore(load_checkpoint(tmp_path))
+    resumed.stages.restore(load_checkpoint(tmp_path))
     assert finished(resumed)
     assert resumed.repair.state() == repaired.repair.state()
     for name, tensor in repaired.optimiser.state().items():
@@ -138,28 +145,28 @@ def test_a_run_stopped_between_repairs_ends_as_an_uninterrupted_one(scene, tmp_p
 
 
 def test_nothing_is_touched_on_a_healthy_run(scene, tmp_path, monkeypatch):
-    stages = start(scene, tmp_path, true_poses(scene))
+    run = start(scene, tmp_path, true_poses(scene))
     flagged = []
-    close = stages.optimiser.camera_errors.close_block
+    close = run.optimiser.camera_errors.close_block
 
     def closed() -> None:
         close()
-        flagged.append(bool(stages.optimiser.camera_errors.lost.any()))
+        flagged.append(bool(run.optimiser.camera_errors.lost.any()))
 
-    monkeypatch.setattr(stages.optimiser.camera_errors, "close_block", closed)
-    assert finished(stages)
+    monkeypatch.setattr(run.optimiser.camera_errors, "close_block", closed)
+    assert finished(run)
     assert len(flagged) == STEPS // PERIOD
     assert not any(flagged)
-    assert stages.repair.repaired == []
-    assert errors_deg(stages, true_poses(scene)).max() < 10
+    assert run.repair.repaired == []
+    assert errors_deg(run, true_poses(scene)).max() < 10
 
 
 def test_a_run_spends_no_more_than_its_share(scene, tmp_path, monkeypatch):
     monkeypatch.setattr(lost_cameras, "RUN_SHARE", 0.2)
-    stages = start(scene, tmp_path, spoiled(true_poses(scene)))
-    finished(stages)
-    assert stages.repair.repaired == [TURNED]  # the first one found takes all there is
-    assert bool(stages.optimiser.camera_errors.suspects[ORBITED])
+    run = start(scene, tmp_path, spoiled(true_poses(scene)))
+    finished(run)
+    assert run.repair.repaired == [TURNED]  # the first one found takes all there is
+    assert bool(run.optimiser.camera_errors.suspects[ORBITED])
 
 
 def test_in_an_open_scene_a_camera_that_looks_where_nobody_does_is_brought_home(scene, tmp_path):
@@ -169,27 +176,29 @@ def test_in_an_open_scene_a_camera_that_looks_where_nobody_does_is_brought_home(
     truth = true_poses(open_scene)
     given = truth.copy()
     given[TURNED] = given[TURNED] @ np.diag([-1.0, 1, -1, 1])
-    stages = start(open_scene, tmp_path, given, stop_at=90)
-    finished(stages)
-    errors = stages.optimiser.camera_errors
+    run = start(open_scene, tmp_path, given, stop_at=90)
+    finished(run)
+    errors = run.optimiser.camera_errors
     errors._stood_out.zero_()
     errors.errors.fill_(1e-3)  # whatever the errors say
-    stages.repair.run()
-    assert stages.repair.repaired == [TURNED]
+    run.repair.run()
+    assert run.repair.repaired == [TURNED]
     assert (
-        errors_deg(stages, truth)[TURNED] < 60
+        errors_deg(run, truth)[TURNED] < 60
     )  # the field has hardly formed: the view is found, not yet the pose
 
 
 def test_the_report_names_those_that_stay_lost_and_those_repaired(scene, tmp_path):
-    stages = start(scene, tmp_path, true_poses(scene), stop_at=1)
-    finished(stages)
-    stages.optimiser.camera_errors._stood_out[TURNED] = 2
-    stages.repair.repaired = [ORBITED]
+    run = start(scene, tmp_path, true_poses(scene), stop_at=1)
+    finished(run)
+    run.optimiser.camera_errors._stood_out[TURNED] = 2
+    run.repair.repaired = [ORBITED]
     dataset = scene[0]
-    known = pose_uncertainty(stages, Finish(), None)
-    partial = run_report(stages, [], None, "partial", uncertainty=known)
-    report = write_result(OutputFolder(tmp_path), stages, Evaluation(), partial)
+    known = pose_uncertainty(dataset, run.optimiser, Finish(), None)
+    partial = run_report(
+        run.scene, run.optimiser, run.state.record, run.repair.repaired, [], None, uncertainty=known
+    )
+    report = write_result(OutputFolder(tmp_path), run.scene, run.optimiser, Monitor(), Evaluation(), partial)
     lost = [image.name for image in report.images if image.uncertainty.why_unknown == LOST]
     assert lost == [dataset.names[TURNED]]
     assert [image.name for image in report.images if image.repaired] == [dataset.names[ORBITED]]

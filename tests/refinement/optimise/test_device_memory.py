@@ -8,9 +8,8 @@ import torch
 from biresnerf.geometry.pose_error import pose_error
 from biresnerf.refinement.optimise.device_memory import smaller_batches, step_that_fits
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
-from biresnerf.refinement.stages.two_stages import TwoStages
 from biresnerf.refinement.verdict.run_report import run_report
-from tests.refinement.tiny_scene import finished, given_scene, tiny_optimiser, tiny_options, tiny_set
+from tests.refinement.tiny_scene import TinyRun, finished, given_scene, tiny_optimiser, tiny_options, tiny_set
 
 OPTIONS = tiny_options(samples_per_step=1 << 16)
 
@@ -43,13 +42,13 @@ def limit_memory(optimiser: JointOptimiser, rays: int) -> list[int]:
 @pytest.mark.slow
 def test_a_run_without_enough_memory_ends_with_smaller_batches_and_says_so(scene, optimiser, tmp_path):
     through = limit_memory(optimiser, rays=400)
-    stages = TwoStages(optimiser, given_scene(*scene, held_out=[3]), tmp_path)
-    assert finished(stages)
+    run = TinyRun(optimiser, given_scene(*scene, held_out=[3]), tmp_path)
+    assert finished(run)
     assert len(through) == optimiser.schedule.steps
     assert max(through) <= 400
     assert optimiser.batch_share < 1
     assert pose_error(optimiser.poses.poses().numpy(), scene[0].world_from_cam).aligned.rotation_deg.mean < 5
-    warnings = run_report(stages, [], None, "partial").warnings
+    warnings = run_report(run.scene, optimiser, run.state.record, [], [], None).warnings
     assert any("GPU's memory is too small" in warning for warning in warnings)
 
 

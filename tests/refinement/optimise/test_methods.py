@@ -22,10 +22,9 @@ from biresnerf.pipeline import refine_poses
 from biresnerf.progress import Monitor, Progress
 from biresnerf.refinement.optimise.methods import find_method
 from biresnerf.refinement.stages.checkpoint import load_checkpoint
-from biresnerf.refinement.stages.two_stages import TwoStages
 from biresnerf.report import Report
 from biresnerf.studies.baselines import methods as baselines
-from tests.refinement.tiny_scene import finished, given_scene, tiny_optimiser, tiny_run, tiny_set
+from tests.refinement.tiny_scene import TinyRun, finished, given_scene, tiny_optimiser, tiny_run, tiny_set
 
 pytestmark = pytest.mark.slow
 
@@ -115,18 +114,16 @@ def test_a_stopped_and_resumed_run_ends_bit_for_bit_as_an_uninterrupted_one(tmp_
     dataset, images = tiny_set(tmp_path / "scene", views=4, size=16)
     options = small_options(method).resolved("cpu")
 
-    def stages(stop_at: int | None) -> TwoStages:
+    def begun(stop_at: int | None) -> TinyRun:
         optimiser = tiny_optimiser(dataset, images, options, held_out=[1])
         stop = lambda: optimiser.step_index == stop_at  # noqa: E731
-        return TwoStages(
-            optimiser, given_scene(dataset, images, [1]), tmp_path, monitor=Monitor(should_stop=stop)
-        )
+        return TinyRun(optimiser, given_scene(dataset, images, [1]), tmp_path, Monitor(should_stop=stop))
 
-    whole = stages(None)
+    whole = begun(None)
     assert finished(whole)
-    assert not finished(stages(13))
-    resumed = stages(None)
-    resumed.restore(load_checkpoint(tmp_path))
+    assert not finished(begun(13))
+    resumed = begun(None)
+    resumed.stages.restore(load_checkpoint(tmp_path))
     assert finished(resumed)
     state = resumed.optimiser.state()
     for name, tensor in whole.optimiser.state().items():

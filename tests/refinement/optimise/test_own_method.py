@@ -17,11 +17,12 @@ from biresnerf.data.synthetic.scene import write_synthetic_scene
 from biresnerf.errors import InputError, Interrupted
 from biresnerf.pipeline import refine_poses
 from biresnerf.progress import Progress
+from biresnerf.refinement.lost.lost_cameras import LostCameraRepair
 from biresnerf.refinement.optimise.method_changes import changed, differences
 from biresnerf.refinement.optimise.methods import BIRESNERF, Method, find_method
 from biresnerf.refinement.stages.checkpoint import CHECKPOINT
-from biresnerf.refinement.stages.two_stages import TwoStages
 from tests.refinement.tiny_scene import (
+    TinyRun,
     given_scene,
     tiny_optimiser,
     tiny_options,
@@ -172,12 +173,12 @@ def test_without_the_guard_moving_cameras_do_not_put_the_switch_off(tmp_path):
     dataset, images = tiny_set(tmp_path)
     for guarded in (True, False):
         method = replace(BIRESNERF, guard=guarded)
-        stages = TwoStages(
+        run = TinyRun(
             tiny_optimiser(dataset, images, tiny_options(), method=method),
             given_scene(dataset, images),
             tmp_path,
         )
-        assert stages.detector.guarded is guarded
+        assert run.stages.detector.guarded is guarded
 
 
 def test_without_a_near_plane_open_scenes_are_sampled_from_the_schedules_own_distance(tmp_path):
@@ -206,13 +207,9 @@ def test_without_repair_no_fixed_point_is_due(tmp_path):
     dataset, images = tiny_set(tmp_path)
     due = {}
     for on in (True, False):
-        stages = TwoStages(
-            tiny_optimiser(dataset, images, tiny_options(), method=replace(BIRESNERF, repair=on)),
-            given_scene(dataset, images),
-            tmp_path,
-        )
-        stages.optimiser.step_index = 10
-        due[on] = stages.repair.due()
+        optimiser = tiny_optimiser(dataset, images, tiny_options(), method=replace(BIRESNERF, repair=on))
+        optimiser.step_index = 10
+        due[on] = LostCameraRepair(optimiser).due()
     assert due == {True: True, False: False}
 
 

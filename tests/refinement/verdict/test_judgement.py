@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,6 +25,7 @@ from biresnerf.report import EpipolarEvidence
 from biresnerf.studies.scenes import with_poses
 from tests.refinement.tiny_scene import (
     CPU,
+    TinyRun,
     given_scene,
     tiny_optimiser,
     tiny_options,
@@ -59,13 +60,12 @@ def judged(
     given: np.ndarray,
     refined: np.ndarray,
     tracks: Tracks | None = None,
-    **how: Any,
 ) -> Judgement:
     """The verdict on a run that was given one set of poses and ended with the other."""
     dataset, images = scene
     optimiser = tiny_optimiser(with_poses(dataset, refined), images, OPTIONS, held_out=[3])
     run = replace(given_scene(with_poses(dataset, given), images, [3]), tracks=tracks)
-    return judge_poses(run, optimiser, **how)
+    return judge_poses(*TinyRun(optimiser, run, Path()).parts)
 
 
 def test_true_poses_in_place_of_noisy_ones_are_an_improvement(scene, noisy):
@@ -99,15 +99,12 @@ def test_a_gain_that_may_be_blurs_must_stand_in_longer_trainings_unless_matches_
 
 
 def test_a_gain_that_may_be_blurs_says_nothing_where_time_ends_before_longer_trainings(scene, noisy):
-    asked: list[int] = []
-
-    def none_that_are_longer(times: int) -> int:
-        asked.append(times)
-        return int(times == 1)
-
-    truth = scene[0].world_from_cam
-    hurried = judged(scene, noisy, truth, rounds_in_time=none_that_are_longer).verdict
-    assert asked == [1, compare_rigs.LONGER]
+    (dataset, images), rounds_s = scene, 100.0
+    optimiser = tiny_optimiser(dataset, images, OPTIONS, held_out=[3])
+    run = TinyRun(optimiser, given_scene(with_poses(dataset, noisy), images, [3]), Path())
+    run.forecast.rates["trial step"], run.forecast.left["judging"] = 1.0, rounds_s
+    run.end_in(1.5 * rounds_s)
+    hurried = judge_poses(*run.parts).verdict
     assert hurried.heldout.psnr.finding == "better"
     assert (hurried.verdict, hurried.returned) == ("inconclusive", "input")
     assert "too much to tell" in hurried.why[0]
@@ -132,9 +129,12 @@ def test_trainings_end_once_they_decide_but_for_pictures(scene, monkeypatch):
         run = given_scene(with_poses(dataset, perturb_poses(truth, noise, seed=1)), images, [3])
         works: list[float] = []
         shares: list[float] = []
-        judgement = judge_poses(run, optimiser, report=shares.append, took=works.append)
+        parts = TinyRun(optimiser, run, Path())
+        monkeypatch.setattr(parts.forecast, "advance", shares.append)
+        monkeypatch.setattr(parts.forecast, "took", works.append)
+        judgement = judge_poses(*parts.parts)
         assert judgement.verdict.heldout.steps == decided
-        assert works == [2 * (max(pictured, decided) + other_rounds)]
+        assert works == [workload.JUDGING + 2 * (max(pictured, decided) + other_rounds)]
         if not other_rounds:
             assert shares[-1] == pytest.approx(decided / pictured), "pictures take the rest"
         assert judgement.renders.keys() == {3}
@@ -149,7 +149,7 @@ def test_trainings_end_once_they_agree_with_what_matches_say(scene, monkeypatch)
     def steps(given: np.ndarray, refined: np.ndarray, tracks: Tracks | None) -> int:
         optimiser = tiny_optimiser(with_poses(dataset, refined), images, options, held_out=[3])
         run = replace(given_scene(with_poses(dataset, given), images, [3]), tracks=tracks)
-        return judge_poses(run, optimiser).verdict.heldout.steps
+        return judge_poses(*TinyRun(optimiser, run, Path()).parts).verdict.heldout.steps
 
     matches = true_matches(dataset)
     assert steps(noisy, truth, matches) == steps(truth, noisy, matches) < 80
@@ -211,7 +211,8 @@ def test_images_whose_poses_were_guessed_have_no_part_in_the_trials(scene, noisy
         frames = list(with_poses(dataset, given).frames)
         frames[1] = replace(frames[1], pose_source="nearest-view")
         run = given_scene(replace(dataset, frames=tuple(frames)), images, [3])
-        return judge_poses(run, tiny_optimiser(with_poses(dataset, refined), images, OPTIONS, held_out=[3]))
+        optimiser = tiny_optimiser(with_poses(dataset, refined), images, OPTIONS, held_out=[3])
+        return judge_poses(*TinyRun(optimiser, run, Path()).parts)
 
     found = judged_with_a_guess(truth[0])
     assert found.verdict.verdict == "improved"

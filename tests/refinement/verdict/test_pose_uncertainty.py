@@ -8,14 +8,13 @@ import pytest
 from biresnerf.geometry.pose_error import pose_error
 from biresnerf.geometry.similarity import Similarity, align_by_spread
 from biresnerf.refinement.adjustment.cameras import Cameras
-from biresnerf.refinement.finish.adjust_cameras import adjust_cameras
 from biresnerf.refinement.finish.expected_errors import TRACK_MODEL_ERROR
 from biresnerf.refinement.finish.outcome import Finish
 from biresnerf.refinement.start.refined_poses import RefinedPoses
 from biresnerf.refinement.verdict.judgement import judge_poses
 from biresnerf.refinement.verdict.pose_uncertainty import MATCHES_CONTRADICT, NO_EVIDENCE, pose_uncertainty
 from tests.refinement.adjustment.rig import disturbed
-from tests.refinement.finish.test_adjust_cameras import VIEWS, stages
+from tests.refinement.finish.test_adjust_cameras import VIEWS, adjusted, begun
 
 SCALE = 50.0  # of the caller's world
 CARRY = Similarity(SCALE, np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), np.array([7.0, -3, 100]))
@@ -26,9 +25,13 @@ def generator():
     return np.random.default_rng(2)
 
 
+def known_of(run, finish, judgement=None):
+    return pose_uncertainty(run.scene.dataset, run.optimiser, finish, judgement)
+
+
 def noisy_run(folder, rng):
     """A run whose input is far off, in a world of its own, and the true poses there."""
-    run, truth = stages(
+    run, truth = begun(
         folder, rng, given=lambda poses: CARRY.apply_to_poses(disturbed(poses, rng, 0.1, 0.3)), noise_px=0.1
     )
     return run, CARRY.apply_to_poses(truth)
@@ -36,7 +39,7 @@ def noisy_run(folder, rng):
 
 def test_errors_in_the_callers_frame_and_unit_are_within_the_bounds(tmp_path, rng):
     run, truth = noisy_run(tmp_path, rng)
-    known = pose_uncertainty(run, adjust_cameras(run), None)
+    known = known_of(run, adjusted(run))
     assert {each.known_from for each in known} == {"matches"}
     poses = RefinedPoses.now(run.scene.dataset, run.optimiser).world_from_cam
     errors = pose_error(poses, truth).aligned
@@ -53,7 +56,7 @@ def test_errors_in_the_callers_frame_and_unit_are_within_the_bounds(tmp_path, rn
 
 def test_errors_along_the_axes_of_the_callers_world_are_as_large_as_the_covariance_says(tmp_path, rng):
     run, truth = noisy_run(tmp_path, rng)
-    matrices = np.array([each.covariance for each in pose_uncertainty(run, adjust_cameras(run), None)])
+    matrices = np.array([each.covariance for each in known_of(run, adjusted(run))])
     poses = RefinedPoses.now(run.scene.dataset, run.optimiser).world_from_cam
     frame = align_by_spread(truth, poses)
     errors = Cameras.of(frame.apply_to_poses(truth)).apart(Cameras.of(poses)).reshape(-1, 6)
@@ -65,19 +68,19 @@ def test_errors_along_the_axes_of_the_callers_world_are_as_large_as_the_covarian
 
 
 def test_without_evidence_nothing_is_said_to_be_known(tmp_path, rng):
-    run, _ = stages(tmp_path, rng)
-    for each in pose_uncertainty(run, Finish(), None):
+    run, _ = begun(tmp_path, rng)
+    for each in known_of(run, Finish()):
         assert (each.rotation_deg, each.position, each.covariance) == (None, None, None)
         assert (each.known_from, each.why_unknown) == ("nothing", NO_EVIDENCE)
 
 
 def test_a_pose_that_its_own_matches_contradict_is_not_known(tmp_path, rng):
-    run, _ = stages(tmp_path, rng)
-    finish = adjust_cameras(run)
-    judgement = judge_poses(run.scene, run.optimiser)
+    run, _ = begun(tmp_path, rng)
+    finish = adjusted(run)
+    judgement = judge_poses(*run.parts)
     errors = judgement.epipolar_px.copy()
     errors[:, 3] = 20 * np.nanmedian(errors)
-    known = pose_uncertainty(run, finish, replace(judgement, epipolar_px=errors))
+    known = known_of(run, finish, replace(judgement, epipolar_px=errors))
     assert [each.why_unknown for each in known] == [
         MATCHES_CONTRADICT if i == 3 else None for i in range(VIEWS)
     ]
@@ -86,13 +89,12 @@ def test_a_pose_that_its_own_matches_contradict_is_not_known(tmp_path, rng):
 def test_matches_speak_for_poses_only_where_they_determine_most_of_them(tmp_path, rng, monkeypatch):
     monkeypatch.setattr(f"{judge_poses.__module__}.compare_placed", lambda *_, **__: None)
     run, _ = noisy_run(tmp_path, rng)
-    finish = adjust_cameras(run)
+    finish = adjusted(run)
     evidence = finish.fit.evidence
     of_few = replace(evidence, tracks=evidence.tracks.where(evidence.tracks.image < VIEWS // 3))
     open_ = replace(finish, fit=replace(finish.fit, evidence=of_few))
     told, untold, refused, never = (
-        judge_poses(run.scene, run.optimiser, finish=each)
-        for each in (finish, open_, finish.refused(), Finish())
+        judge_poses(*run.parts, finish=each) for each in (finish, open_, finish.refused(), Finish())
     )
     assert (told.verdict.verdict, told.verdict.returned) == ("improved", "refined")
     assert 0 < untold.errors.known.sum() < VIEWS / 2
@@ -104,16 +106,12 @@ def test_matches_speak_for_poses_only_where_they_determine_most_of_them(tmp_path
 
 def test_what_the_verdict_found_of_the_errors_is_what_the_report_has(tmp_path, rng):
     run, _ = noisy_run(tmp_path, rng)
-    finish = adjust_cameras(run)
-    judgement = judge_poses(run.scene, run.optimiser, finish=finish)
+    finish = adjusted(run)
+    judgement = judge_poses(*run.parts, finish=finish)
     assert judgement.verdict.returned == "refined"
     assert judgement.errors is not None
-    assert pose_uncertainty(run, finish, judgement) == pose_uncertainty(
-        run, finish, replace(judgement, errors=None)
-    )
+    assert known_of(run, finish, judgement) == known_of(run, finish, replace(judgement, errors=None))
     # Where the input's poses come back, the evidence says that these are far off, or nothing.
     kept = replace(judgement, verdict=judgement.verdict.model_copy(update={"returned": "input"}))
-    refined, given = (
-        [each.rotation_deg for each in pose_uncertainty(run, finish, of)] for of in (judgement, kept)
-    )
+    refined, given = ([each.rotation_deg for each in known_of(run, finish, of)] for of in (judgement, kept))
     assert all(each is None or each > 2 * max(refined) for each in given)

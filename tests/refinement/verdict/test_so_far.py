@@ -6,16 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import pose_error
 from biresnerf.refinement.stages.checkpoint import load_checkpoint
-from biresnerf.refinement.stages.two_stages import TwoStages
 from biresnerf.refinement.verdict import judgement
 from biresnerf.refinement.verdict.so_far import UNMEASURED, SoFar, poses_so_far
 from biresnerf.refinement.verdict.verdict import EPIPOLAR_MATTERS
-from tests.refinement.tiny_scene import given_scene, tiny_optimiser, tiny_options, tiny_set
+from tests.refinement.tiny_scene import TinyRun, given_scene, tiny_optimiser, tiny_options, tiny_set
 from tests.refinement.verdict.test_judgement import VIEWS, true_matches, with_poses
 
 pytestmark = pytest.mark.slow
@@ -42,17 +42,17 @@ class Wandering:
         self.truth, self.folder, self._images, self._matches = dataset, folder, images, matches
         self._options = tiny_options(verdict=verdict)
         self.dataset = with_poses(dataset, self.noisy(given))
-        self.stages = self._begun()
+        self.run = self._begun()
 
-    def _begun(self) -> TwoStages:
+    def _begun(self) -> TinyRun:
         run = replace(given_scene(self.dataset, self._images), tracks=self._matches)
-        return TwoStages(tiny_optimiser(self.dataset, self._images, self._options), run, self.folder)
+        return TinyRun(tiny_optimiser(self.dataset, self._images, self._options), run, self.folder)
 
     def resume(self) -> None:
         """As another process does that has the checkpoint alone."""
-        self.stages._save()
-        self.stages = self._begun()
-        self.stages.restore(load_checkpoint(self.folder))
+        self.run.stages._save()
+        self.run = self._begun()
+        self.run.stages.restore(load_checkpoint(self.folder))
 
     def noisy(self, noise: float) -> np.ndarray:
         return perturb_poses(self.truth.world_from_cam, noise, seed=1)
@@ -63,11 +63,13 @@ class Wandering:
 
     def at_poses(self, world_from_cam: np.ndarray) -> SoFar:
         """The same at any poses [n, 4, 4]."""
-        self.stages.place(self.stages.optimiser.frame.unit_from_world.apply_to_poses(world_from_cam))
-        return poses_so_far(self.stages)
+        optimiser = self.run.optimiser
+        unit_from_cam = optimiser.frame.unit_from_world.apply_to_poses(world_from_cam)
+        optimiser.poses.place(torch.from_numpy(unit_from_cam))
+        return poses_so_far(*self.run.parts)
 
     def error_deg(self, offered: SoFar) -> float:
-        poses, _ = offered.offered(self.stages.scene)
+        poses, _ = offered.offered(self.run.scene)
         return pose_error(poses, self.truth.world_from_cam).aligned_robust.rotation_deg.mean
 
 
@@ -93,7 +95,7 @@ def test_the_inputs_poses_are_offered_until_others_are_better_and_the_latest_ref
     for noise in (0.05, 0.02, 0.1):
         offered = run.at(noise)
         assert (offered.verdict.verdict, offered.verdict.returned) == ("kept_input", "input")
-        poses, dataset = offered.offered(run.stages.scene)
+        poses, dataset = offered.offered(run.run.scene)
         np.testing.assert_array_equal(poses, run.dataset.world_from_cam)
         assert dataset is run.dataset
         latest = pose_error(offered.refined.world_from_cam, run.noisy(noise)).aligned_robust
@@ -124,18 +126,18 @@ def test_poses_that_matches_cannot_tell_from_the_best_take_its_place_but_never_d
 
 def test_a_resumed_run_offers_the_best_poses_of_the_one_that_was_interrupted(scene, tmp_path):
     run = Wandering(scene, tmp_path, 0.1, matches=true_matches(scene[0]))
-    good, _ = run.at(0.01).offered(run.stages.scene)
+    good, _ = run.at(0.01).offered(run.run.scene)
     run.at(0.2)
     run.resume()
-    offered = poses_so_far(run.stages)
+    offered = poses_so_far(*run.run.parts)
     assert offered.verdict.verdict == "improved"
-    np.testing.assert_allclose(offered.offered(run.stages.scene)[0], good, atol=1e-12)
-    np.testing.assert_allclose(run.at(0.3).offered(run.stages.scene)[0], good, atol=1e-12)
+    np.testing.assert_allclose(offered.offered(run.run.scene)[0], good, atol=1e-12)
+    np.testing.assert_allclose(run.at(0.3).offered(run.run.scene)[0], good, atol=1e-12)
 
 
 def test_a_lens_is_offered_with_the_poses_that_it_was_found_with(scene, tmp_path):
     run = Wandering(scene, tmp_path, 0.1, matches=true_matches(scene[0]))
-    lenses, cameras = run.stages.optimiser.lenses, run.dataset.cameras
+    lenses, cameras = run.run.optimiser.lenses, run.dataset.cameras
     longer = tuple(
         replace(camera, params=(1.001 * camera.params[0], *camera.params[1:])) for camera in cameras
     )
@@ -144,7 +146,7 @@ def test_a_lens_is_offered_with_the_poses_that_it_was_found_with(scene, tmp_path
     lenses.place(cameras, cameras)
     offered = run.at(0.2)
     assert offered.refined.dataset.cameras[0].params == pytest.approx(longer[0].params)
-    assert run.stages.optimiser.lenses.refined(run.dataset).cameras[0].params == cameras[0].params
+    assert run.run.optimiser.lenses.refined(run.dataset).cameras[0].params == cameras[0].params
 
 
 def test_without_matches_the_latest_poses_are_offered_and_it_is_said_that_nothing_measured_them(
@@ -155,7 +157,7 @@ def test_without_matches_the_latest_poses_are_offered_and_it_is_said_that_nothin
         offered = run.at(noise)
         assert (offered.verdict.verdict, offered.verdict.returned) == ("inconclusive", "refined")
         assert offered.verdict.why[0] == UNMEASURED
-        poses, _ = offered.offered(run.stages.scene)
+        poses, _ = offered.offered(run.run.scene)
         assert pose_error(poses, run.noisy(noise)).aligned_robust.rotation_deg.max < 1e-3
 
 
@@ -165,7 +167,7 @@ def test_without_matches_poses_that_lost_the_inputs_frame_are_not_offered(scene,
     upside_down[: VIEWS // 2 + 1, :3, :3] = upside_down[: VIEWS // 2 + 1, :3, :3] @ np.diag([-1.0, 1, -1])
     offered = run.at_poses(upside_down)
     assert (offered.verdict.verdict, offered.verdict.returned) == ("failed_check", "input")
-    np.testing.assert_array_equal(offered.offered(run.stages.scene)[0], run.dataset.world_from_cam)
+    np.testing.assert_array_equal(offered.offered(run.run.scene)[0], run.dataset.world_from_cam)
 
 
 def test_a_run_that_is_to_have_no_verdict_offers_the_latest_poses(scene, tmp_path):
