@@ -46,7 +46,8 @@ def match_files(
     notes = []
     for rule, key in _RULES if rules is None else rules:
         open_names = _unique([name for name in names if name not in found], key)
-        open_files = _unique([file for file in files if file not in found.values()], key)
+        taken = set(found.values())
+        open_files = _unique([file for file in files if file not in taken], key)
         pairs = {name: open_files[shared] for shared, name in open_names.items() if shared in open_files}
         if pairs:
             example = next(iter(pairs.items()))
@@ -86,9 +87,7 @@ _RULES: tuple[Rule, ...] = (
     ("by path without extension", lambda name: posixpath.splitext(_normal(name))[0]),
     (
         "by file name, with numbers compared as numbers",
-        lambda name: re.sub(
-            r"\d+", lambda found: str(int(found[0])), PurePosixPath(_normal(name)).stem.casefold()
-        ),
+        lambda name: re.sub(r"0*(\d+)", r"\1", PurePosixPath(_normal(name)).stem.casefold()),
     ),
 )
 

@@ -30,7 +30,7 @@ _NO_POSES = re.compile(r"\.(xmp|aae|thm|md|html|py|sh|ply|obj|mtl)$", re.I)
 _OF_POSE = (7, 8, 9, 12, 13, 16, 17, 19, 20, 25)
 _MOST_A_PHOTO = 50  # rows; a trajectory has more poses than photos, and points are more than these
 _MOST_LINES = 200  # a photo
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+_NUMBER = re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?")
 _INNERMOST = re.compile(r"[\[({]([^\[\](){}]*)[\])}]")
 
 

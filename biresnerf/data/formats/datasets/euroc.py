@@ -111,7 +111,7 @@ def _read_sensor(file: Path) -> tuple[NDArray[np.float64], Camera]:
     text = re.sub(r"#[^\n]*", "", read_text(file))
 
     def numbers(key: str, count: int) -> list[float]:
-        match = re.search(rf"\b{key}:[^\[\]]*\[([^\]]*)\]", text)
+        match = re.search(rf"\b{key}:[^\[\]]{{0,200}}\[([^\]]{{0,2000}})\]", text)
         where = f"cam0/{file.name} {key}"
         found = finite_numbers(match[1].replace(",", " ").split() if match else [], where, _HINT).tolist()
         if len(found) != count:
@@ -123,7 +123,7 @@ def _read_sensor(file: Path) -> tuple[NDArray[np.float64], Camera]:
     fx, fy, cx, cy = numbers("intrinsics", 4)
     a, b, c, d = numbers("distortion_coefficients", 4)
     width, height = numbers("resolution", 2)
-    model = re.search(r"^\s*distortion_model:\s*(\S+)", text, re.MULTILINE)
+    model = re.search(r"^[ \t]*distortion_model:[ \t]*(\S+)", text, re.MULTILINE)
     kind, centre = model[1] if model else "", (cx + 0.5, cy + 0.5)
     if kind in ("equidistant", "fisheye"):
         full = FullParameters(fx, fy, *centre, k1=a, k2=b, k3=c, k4=d, fisheye=True)

@@ -29,7 +29,7 @@ TANKS_AND_TEMPLES = Format(
     checked_against="its converter; isl-org/TanksAndTemples",
 )
 _HINT = "Give five lines an image: its number, the number in the reconstruction and an error; then 4 rows of 4 numbers."
-_BEGINS = re.compile(rb"\s*\d+\s+-?\d+\s+\S+[ \t]*\r?\n(\s*[-+]?[\d.]+(e[-+]?\d+)?){4}\s", re.IGNORECASE)
+_BEGINS = re.compile(rb"\s*\d+\s+-?\d+\s+\S+[ \t]*\r?\n\s*([-+]?[\d.]+(e[-+]?\d+)?\s+){4}", re.IGNORECASE)
 _HEAD_BYTES = 4096
 
 

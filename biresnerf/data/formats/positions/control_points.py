@@ -62,27 +62,29 @@ def control_points(dataset: Dataset) -> ControlPoints | None:
         return dataset.control
     rows, degrees, epsg = _rows_of(file)
     found, _ = match_files(list(dict.fromkeys(row.image for row in rows if row.image)), given.file_names)
-    frame = {name: given.file_names.index(known) for name, known in found.items()}
-    names = list(dict.fromkeys(row.name for row in rows))
-    first = [next(row for row in rows if row.name == name) for name in names]
+    index_of = {name: index for index, name in enumerate(given.file_names)}
+    frame = {name: index_of[known] for name, known in found.items()}
+    firsts: dict[str, _Row] = {}
     for row in rows:
-        if row.place != first[names.index(row.name)].place:
+        if row.place != firsts.setdefault(row.name, row).place:
             raise _invalid(row.where, f"has other coordinates of {row.name[:100]!r} than a line before.")
+    number = {name: place for place, name in enumerate(firsts)}
     seen = {}
     for row in rows:
         if row.image in frame and (shown := place_in_view(dataset, frame[row.image], row.xy)) is not None:
-            seen[names.index(row.name), shown[0]] = shown[1]
+            seen[number[row.name], shown[0]] = shown[1]
     if markers := _markers(rows):
-        seen |= {(names.index(name), at): xy for (name, at), xy in marked(dataset, markers).items()}
+        seen |= {(number[name], at): xy for (name, at), xy in marked(dataset, markers).items()}
     if not seen:
         return None
+    first = list(firsts.values())
     places, origin = np.array([row.place for row in first]), None
     if degrees:
         origin = tuple(np.median(places, axis=0).tolist())
         places = east_north_up(places, np.array(origin))
     index = np.array(sorted(seen), dtype=np.int64)
     points = ControlPoints(
-        file.name, tuple(names), places, np.array([row.accuracy for row in first]),
+        file.name, tuple(firsts), places, np.array([row.accuracy for row in first]),
         np.array([row.check for row in first]), index[:, 0], index[:, 1],
         np.array([seen[point, image] for point, image in index.tolist()]), origin, epsg,
     )  # fmt: skip
