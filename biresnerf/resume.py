@@ -16,14 +16,13 @@ from biresnerf.refinement.optimise.method_changes import differences
 from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.stages.checkpoint import (
     COARSE,
-    OTHER_FOLDER,
     SEEDING,
     TRACKS,
     Checkpoint,
     RunOrigin,
     load_checkpoint,
 )
-from biresnerf.stages import ReusableStage
+from biresnerf.stages import OTHER_FOLDER, ReusableStage
 
 
 def earlier_work(folder: Path) -> Checkpoint | None:

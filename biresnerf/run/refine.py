@@ -18,6 +18,7 @@ from biresnerf.result import Result, load
 from biresnerf.run.photos_added import joined_to
 from biresnerf.run.show_progress import ShownProgress
 from biresnerf.run.stop_request import StopRequest
+from biresnerf.write.output_folder import OutputFolder
 
 if TYPE_CHECKING:
     from biresnerf.refinement.optimise.methods import Method
@@ -57,7 +58,7 @@ def refine(
 
     Raises:
         InputError: the user can fix it: ``invalid_options`` with the nearest name of a wrong one, or a code of
-            docs/troubleshooting.md. Those of the input and the options come before torch is loaded.
+            docs/troubleshooting.md. Those of input, output and options come before torch is loaded.
         RefinementError: the optimisation diverged.
         Interrupted: stopped on request; the checkpoint and a partial result are in `output`, or nothing yet where
             initial poses were still being looked for.
@@ -65,6 +66,8 @@ def refine(
     let_waiting_threads_sleep()
     own = None if isinstance(method, str) else method
     asked = parse_options(options if own else {"method": method, **options})
+    if not overwrite:
+        OutputFolder(Path(output)).refuse_finished()
     with ExitStack() as during:
         on_progress = during.enter_context(ShownProgress()) if progress is True else progress or None
         stop = should_stop or during.enter_context(StopRequest(signal.SIGINT))

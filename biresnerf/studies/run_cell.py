@@ -27,9 +27,9 @@ from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.method_changes import changed
 from biresnerf.refinement.optimise.methods import find_method
 from biresnerf.refinement.scene.scene import Scene
-from biresnerf.refinement.stages.checkpoint import CHECKPOINT
 from biresnerf.refinement.views.image_metrics import psnr, ssim
 from biresnerf.report import Report
+from biresnerf.stages import CHECKPOINT
 from biresnerf.studies.cell import (
     CELL,
     EXIT_STOPPED,

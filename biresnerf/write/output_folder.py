@@ -13,7 +13,7 @@ from biresnerf.data.show.history import HISTORY
 from biresnerf.data.show.view_file import CONTACT_SHEET, PREVIEW, THUMBNAIL, VIEW
 from biresnerf.errors import InputError
 from biresnerf.options.formats import formats
-from biresnerf.refinement.stages.checkpoint import CHECKPOINT, OTHER_FOLDER
+from biresnerf.stages import CHECKPOINT, OTHER_FOLDER
 from biresnerf.viewer.report_html import REPORT_HTML
 
 REPORT, CONFIG, GEOREFERENCE = "report.json", "config.json", "georeference.json"

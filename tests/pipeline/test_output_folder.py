@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from biresnerf.errors import InputError
-from biresnerf.refinement.stages.checkpoint import CHECKPOINT
+from biresnerf.stages import CHECKPOINT
 from biresnerf.write.output_folder import REPORT, OutputFolder
 
 

@@ -27,9 +27,8 @@ from biresnerf.geometry.similarity import Similarity
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.pipeline import refine_poses
 from biresnerf.progress import Progress
-from biresnerf.refinement.stages.checkpoint import CHECKPOINT
 from biresnerf.report import Report
-from biresnerf.stages import STAGES
+from biresnerf.stages import CHECKPOINT, STAGES
 from biresnerf.viewer.report_html import BUNDLE
 
 pytestmark = pytest.mark.slow

@@ -14,8 +14,8 @@ from biresnerf.errors import InputError, Interrupted
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.pipeline import refine_poses
 from biresnerf.progress import Progress
-from biresnerf.refinement.stages.checkpoint import CHECKPOINT
 from biresnerf.report import Report
+from biresnerf.stages import CHECKPOINT
 from tests.data.scenes import textured_arc
 
 pytestmark = [

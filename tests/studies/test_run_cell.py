@@ -8,8 +8,8 @@ import pytest
 from biresnerf.data.synthetic.scene import write_synthetic_scene
 from biresnerf.errors import Interrupted
 from biresnerf.geometry.perturb import perturb_poses
-from biresnerf.refinement.stages.checkpoint import CHECKPOINT
 from biresnerf.report import Report
+from biresnerf.stages import CHECKPOINT
 from biresnerf.studies.cell import CELL, RUN, Cell, Perturbation
 from biresnerf.studies.run_cell import matched_error, run_cell
 from biresnerf.studies.scenes import find_scene

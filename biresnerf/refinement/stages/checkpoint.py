@@ -24,14 +24,13 @@ from biresnerf.refinement.lost.lost_cameras import RepairState
 from biresnerf.refinement.optimise.optimiser_state import StepState
 from biresnerf.refinement.stages.stability import DetectorState
 from biresnerf.report import CandidateReport, SwitchReason, Verdict
+from biresnerf.stages import CHECKPOINT, OTHER_FOLDER
 
-CHECKPOINT = Path("checkpoint") / "latest.safetensors"
 SEEDING = CHECKPOINT.with_name("seeding.json")  # COLMAP's result; every checkpoint carries a copy
 TRACKS = CHECKPOINT.with_name(KEPT)  # through feature matches; every checkpoint carries them, too
 COARSE = CHECKPOINT.with_name("coarse.safetensors")  # the state at the end of stage 1, for runs that share it
 FORMAT = "9"
 TRACKED = "tracks."  # before the names of tensors
-OTHER_FOLDER = "Choose another output folder, or remove this one."
 
 
 class RunOrigin(FrozenModel, arbitrary_types_allowed=True):

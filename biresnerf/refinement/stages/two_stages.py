@@ -19,10 +19,10 @@ from biresnerf.refinement.lost.lost_cameras import LostCameraRepair
 from biresnerf.refinement.optimise.async_metrics import StepResult
 from biresnerf.refinement.optimise.device_memory import step_that_fits
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
-from biresnerf.refinement.stages.checkpoint import CHECKPOINT, COARSE, Checkpoint
+from biresnerf.refinement.stages.checkpoint import COARSE, Checkpoint
 from biresnerf.refinement.stages.run_state import RunState
 from biresnerf.refinement.stages.stability import StabilityDetector
-from biresnerf.stages import ReusableStage
+from biresnerf.stages import CHECKPOINT, ReusableStage
 
 logger = logging.getLogger(__name__)
 

@@ -14,8 +14,9 @@ from pathlib import Path
 import pytest
 
 from biresnerf.data.synthetic.scene import write_synthetic_scene
-from biresnerf.refinement.stages.checkpoint import CHECKPOINT, load_checkpoint
+from biresnerf.refinement.stages.checkpoint import load_checkpoint
 from biresnerf.report import Report
+from biresnerf.stages import CHECKPOINT
 
 pytestmark = pytest.mark.slow
 
@@ -99,7 +100,10 @@ def test_an_input_that_is_not_there_is_named(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_what_cannot_be_read_is_told_before_torch_is_loaded(tmp_path):
+@pytest.mark.parametrize(("output", "code"), [("out", "no_images"), ("taken", "output_not_empty")])
+def test_what_cannot_be_read_or_written_is_told_before_torch_is_loaded(tmp_path, output, code):
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken/thesis.txt").write_text("mine")
     program = """
 import sys
 from biresnerf.command_line import main
@@ -108,12 +112,12 @@ try:
 finally:
     print("torch" in sys.modules)
 """
-    arguments = ["refine", str(tmp_path), "-o", str(tmp_path / "out")]
+    arguments = ["refine", str(tmp_path), "-o", str(tmp_path / output)]
     done = subprocess.run(
         [sys.executable, "-c", program, *arguments], capture_output=True, text=True, check=False
     )
     assert done.returncode == 2
-    assert "no_images" in done.stderr
+    assert code in done.stderr
     assert done.stdout.split() == ["False"]
 
 

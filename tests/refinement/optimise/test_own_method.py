@@ -20,7 +20,7 @@ from biresnerf.progress import Progress
 from biresnerf.refinement.lost.lost_cameras import LostCameraRepair
 from biresnerf.refinement.optimise.method_changes import changed, differences
 from biresnerf.refinement.optimise.methods import BIRESNERF, Method, find_method
-from biresnerf.refinement.stages.checkpoint import CHECKPOINT
+from biresnerf.stages import CHECKPOINT
 from tests.refinement.tiny_scene import (
     TinyRun,
     given_scene,

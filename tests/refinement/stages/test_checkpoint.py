@@ -17,7 +17,6 @@ from biresnerf.errors import InputError
 from biresnerf.refinement.lost.lost_cameras import RepairState
 from biresnerf.refinement.optimise.optimiser_state import StepState
 from biresnerf.refinement.stages.checkpoint import (
-    CHECKPOINT,
     COARSE,
     FORMAT,
     Checkpoint,
@@ -29,6 +28,7 @@ from biresnerf.refinement.stages.checkpoint import (
 )
 from biresnerf.refinement.stages.stability import DetectorState
 from biresnerf.report import TrialReport
+from biresnerf.stages import CHECKPOINT
 from tests.data.scenes import assert_complete
 
 pytestmark = pytest.mark.slow

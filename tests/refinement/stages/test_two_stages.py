@@ -8,7 +8,8 @@ import torch
 from biresnerf.data.show.history import HISTORY, read_history
 from biresnerf.errors import RefinementError
 from biresnerf.progress import Monitor, Progress
-from biresnerf.refinement.stages.checkpoint import CHECKPOINT, load_checkpoint
+from biresnerf.refinement.stages.checkpoint import load_checkpoint
+from biresnerf.stages import CHECKPOINT
 from tests.refinement.tiny_scene import TinyRun, finished, given_scene, tiny_optimiser, tiny_options, tiny_set
 
 pytestmark = pytest.mark.slow
