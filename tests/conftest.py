@@ -49,6 +49,7 @@ EXPECTED_SKIPS = (
     r"npm cannot install",
     r"no zip program writes",
     r"promtool is not installed",
+    r"only root can make a disk read-only",
     r"nginx is not installed",
     r"all was sent before the signal came",
     r"the Kubernetes manifests are not rendered",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import errno
 import logging
 import re
 import uuid
@@ -16,6 +15,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.http.hosts import is_host
 from service.http.problems import MEDIA_TYPE, ProblemError
+from workers.process.disk_space import refused_to_write
 from workers.settings.logs import log_context
 
 logger = logging.getLogger(__name__)
@@ -157,9 +157,9 @@ def _stopping(request: Request) -> bool:
 def _unexpected(error: Exception, request: Request) -> ProblemError:
     if isinstance(error, ClientDisconnect):
         return ProblemError("client_gone", "The client went away before its request was whole.")
-    if isinstance(error, OSError) and error.errno in {errno.ENOSPC, errno.EDQUOT}:
-        logger.error("disk full: %s", error)
-        return ProblemError("storage_full", "The disk of the service is full.")
+    if refused_to_write(error):
+        logger.error("the disk takes no more: %s", error)
+        return ProblemError("storage_full", "The disk of the service is full or read-only.")
     logger.exception(
         "request %s %s %s failed", request_id(request), request.method, quote(request.scope["path"])
     )

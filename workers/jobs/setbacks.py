@@ -50,9 +50,9 @@ SETBACKS: Mapping[Cause, Setback] = {
     ),
     "disk_full": Setback(
         None,
-        "the worker's disk was full",
+        "the worker's disk was full or read-only",
         "Ask the operator for more room, or try a smaller max_image_size.",
-        "Waiting: the worker's disk is full.",
+        "Waiting: the worker's disk is full or read-only.",
     ),
     "store_away": Setback(
         None,

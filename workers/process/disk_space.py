@@ -43,14 +43,14 @@ def job_disk_budget(settings: Settings) -> DiskBudget:
     return DiskBudget([settings.scratch_dir], settings.disk_reserve_bytes)
 
 
-def is_disk_full(error: BaseException) -> bool:
-    """Whether the operating system refused to write for want of room."""
-    return isinstance(error, OSError) and error.errno in {errno.ENOSPC, errno.EDQUOT}
+def refused_to_write(error: BaseException) -> bool:
+    """Whether the operating system refused to write: no room, or a disk that became read-only, as after a fault."""
+    return isinstance(error, OSError) and error.errno in {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 
 
 def failed_for_room(error: BaseException, folder: Path) -> bool:
-    """Whether what failed in ``folder`` may have failed because its disk is full."""
-    return is_disk_full(error) or shutil.disk_usage(folder).free < _ROOM_BYTES
+    """Whether what failed in ``folder`` may have failed because its disk takes no more."""
+    return refused_to_write(error) or shutil.disk_usage(folder).free < _ROOM_BYTES
 
 
 def _existing(folder: Path) -> Path:

@@ -26,7 +26,7 @@ from workers.jobs.claim import Claim, Fenced
 from workers.jobs.job_states import Requeue
 from workers.jobs.ledger import Ledger
 from workers.jobs.setbacks import Cause, crashed_too_often, used_up
-from workers.process.disk_space import EXIT_DISK, is_disk_full
+from workers.process.disk_space import EXIT_DISK, refused_to_write
 from workers.process.memory_limits import GROUPS, PROC, group_files
 from workers.process.waiting import first_done, retry_while_unavailable
 from workers.records import CRASH_NAME, LOG_NAME, Artifact
@@ -126,7 +126,7 @@ class Attempt:
             return await self._wait("store_away")
         except Exception as error:
             full = isinstance(error, LimitReached) and error.code == "storage_full"
-            if full or is_disk_full(error):
+            if full or refused_to_write(error):
                 return await self._wait("disk_full")
             log.exception("attempt %s of %s failed on our side", self._claim.name, self._claim.job_id)
             return await self._crashed("error", "an error on the worker's side")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from datetime import UTC, datetime
 
 import psycopg
@@ -21,7 +22,7 @@ from workers.database.database import Database, open_database
 from workers.engine import Stores
 from workers.settings.errors import LimitReached, NotFound
 from workers.settings.settings import Settings
-from workers.webhooks.webhook_sender import Result, WebhookSender
+from workers.webhooks.webhook_sender import Result, WebhookSender, signed_headers
 
 pytestmark = pytest.mark.anyio
 
@@ -58,6 +59,25 @@ async def test_a_jobs_life_is_told_signed_and_an_independent_reader_believes_it(
         assert {item.id for item in page.items} == {m.headers["webhook-id"] for m in messages}
         last = await concluded(stores, webhook.id, by_event["job.succeeded"].headers["webhook-id"])
         assert [(a.number, a.status, a.error) for a in last.attempts] == [(1, 204, None)]
+
+
+async def test_a_message_that_somebody_caught_is_of_no_use_later_or_as_another(
+    stores: Stores, dispatchers: Dispatchers
+):
+    async with Receiver().open() as receiver:
+        webhook, secret = await stores.webhooks.create("local", receiver.url, ALL_EVENTS)
+        dispatchers.start()
+        await stores.webhooks.test(webhook.id)
+        (caught,) = await receiver.heard(1)
+    reader, now = standardwebhooks.Webhook(secret), int(time.time())
+    assert reader.verify(caught.body, caught.headers)["type"] == "webhook.test"
+    for name, value in (("webhook-timestamp", str(now + 1)), ("webhook-id", "msg_other")):
+        assert caught.headers[name] != value
+        with pytest.raises(standardwebhooks.WebhookVerificationError, match="No matching signature"):
+            reader.verify(caught.body, {**caught.headers, name: value})
+    old = signed_headers(caught.headers["webhook-id"], now - 6 * 60, caught.body, [secret])
+    with pytest.raises(standardwebhooks.WebhookVerificationError, match="too old"):
+        reader.verify(caught.body, old)
 
 
 async def test_only_what_was_asked_for_comes_and_only_to_its_tenant(
