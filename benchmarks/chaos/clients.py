@@ -5,11 +5,13 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hashlib
+import io
 import json
 import math
 import random
 import time
 import uuid
+import zipfile
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,6 +24,7 @@ FINAL = {"succeeded", "failed", "cancelled"}
 ANSWER_S = 8.0
 LONG_POLL_S = 4.0
 RESULT = {"log.txt", "renders/one.png", "report.json"}
+TUS = {"Tus-Resumable": "1.0.0"}
 
 
 @dataclass
@@ -105,7 +108,10 @@ class Clients:
         """Its dataset, and its place in the queue."""
         dataset = (await self.json("POST", "/v1/datasets", json={"name": "chaos"}))["id"]
         content = json.dumps(seen.plan).encode()
-        await self.json("PUT", f"/v1/datasets/{dataset}/files/plan.json", content=content)
+        if self.chance.random() < 0.5:
+            await self._send_archive(dataset, {"plan.json": content})
+        else:
+            await self.json("PUT", f"/v1/datasets/{dataset}/files/plan.json", content=content)
         await self.json("POST", f"/v1/datasets/{dataset}/finalize")
         seen.job = await self.json(
             "POST",
@@ -113,6 +119,21 @@ class Clients:
             json={"dataset_id": dataset, "options": {"preset": "fast"}},
             headers={"Idempotency-Key": uuid.uuid4().hex},
         )
+
+    async def _send_archive(self, dataset: str, files: dict[str, bytes]) -> None:
+        """By a resumable upload, which some process unpacks once it is whole."""
+        packed = io.BytesIO()
+        with zipfile.ZipFile(packed, "w") as archive:
+            for name, content in files.items():
+                archive.writestr(name, content)
+        whole, length = packed.getvalue(), {**TUS, "Upload-Length": str(packed.tell())}
+        upload = (await self.json("POST", f"/v1/datasets/{dataset}/uploads", headers=length))["id"]
+        at = 0
+        while at < len(whole):
+            offset = {**TUS, "Upload-Offset": str(at), "Content-Type": "application/offset+octet-stream"}
+            await self.call("PATCH", f"/v1/uploads/{upload}", headers=offset, content=whole[at:])
+            there = await self.call("HEAD", f"/v1/uploads/{upload}", headers=TUS)
+            at = int(there.headers["upload-offset"])
 
     async def json(self, method: str, path: str, **request: Any) -> dict[str, Any]:
         answer = await self.call(method, path, **request)
