@@ -7,7 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.given_poses.matched_details import MatchedPair, matched_pairs
+from biresnerf.data.given_poses.constant_turn import best_turn
+from biresnerf.data.given_poses.matched_details import MatchedPair, matched_pairs, off_by
 from biresnerf.data.given_poses.readings import format_of, poses_read_as
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.options.formats import Format
@@ -51,6 +52,12 @@ def borne_out(dataset: Dataset, pairs: Sequence[MatchedPair]) -> PoseQuestion | 
     clearly = best.mean() - as_given.mean() >= MORE and _ahead(best, as_given) >= CLEARLY
     if not clearly:
         return None
+    turn = np.eye(4)
+    turn[:3, :3] = best_turn(dict(zip(rows, given, strict=True)), pairs)
+    turned = {row: pose @ turn for row, pose in zip(rows, given, strict=True)}
+    of_body = np.array([_agreeing(turned[pair.first], turned[pair.second], pair) for pair in pairs])
+    if of_body.mean() - best.mean() >= MORE and _ahead(of_body, best) >= CLEARLY:
+        return None  # poses of what carries the camera, as the run will find
     reading = next(one for one, found in others.items() if _ahead(best, found) <= AS_GOOD)
     shares = float(as_given.mean()), float(others[reading].mean())
     return PoseQuestion(given_poses=reading, question=_asked(reading, shares), agreeing=shares)
@@ -83,39 +90,6 @@ def _agreeing(first: NDArray[np.float64], second: NDArray[np.float64], pair: Mat
     off = off_by(first, second, np.tile(pair.in_first, (len(shifts), 1)), pair.in_second[rows])
     agree = np.clip(1.0 - off / pair.tolerance, 0.0, 1.0).reshape(len(shifts), count).mean(axis=1)
     return float(agree[0] - agree[1:].mean())
-
-
-def off_by(
-    first: NDArray[np.float64],
-    second: NDArray[np.float64],
-    in_first: NDArray[np.float64],
-    in_second: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Angles [m], rad, between what one camera sees in directions [m, 3], and where the other camera may see it.
-
-    That is anywhere on the arc from the other camera (a point at no distance) to the direction itself (infinitely far).
-    Poses are ``world_from_cam`` [4, 4].
-    """
-    far, seen = in_first @ first[:3, :3].T, in_second @ second[:3, :3].T
-    to_far = _angle(seen, far)
-    baseline = first[:3, 3] - second[:3, 3]
-    length = float(np.linalg.norm(baseline))
-    if length == 0.0:
-        return to_far
-    near = np.broadcast_to(baseline / length, far.shape)
-    normal = np.cross(near, far)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    across = (seen * normal).sum(axis=1)
-    along = seen - across[:, None] * normal
-    beside = ((np.cross(near, along) * normal).sum(axis=1) >= 0) & (
-        (np.cross(along, far) * normal).sum(axis=1) >= 0
-    )
-    on_arc = np.arcsin(np.clip(np.abs(across), 0.0, 1.0))
-    return np.where(beside, on_arc, np.minimum(to_far, _angle(seen, near)))
-
-
-def _angle(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.arccos(np.clip((a * b).sum(axis=1), -1.0, 1.0))
 
 
 def _asked(reading: Sequence[PoseReading], shares: tuple[float, float]) -> str:

@@ -118,3 +118,38 @@ def _matches(a: NDArray[np.float32], b: NDArray[np.float32]) -> tuple[NDArray[np
     alike[own, nearest] = -1.0
     good = mutual & (best > _ALIKE) & (1 - best < _DISTINCT**2 * (1 - alike.max(axis=1)))
     return own[good], nearest[good]
+
+
+def off_by(
+    first: NDArray[np.float64],
+    second: NDArray[np.float64],
+    in_first: NDArray[np.float64],
+    in_second: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Angles [m], rad, between what one camera sees in directions [m, 3], and where the other camera may see it.
+
+    That is anywhere on the arc from the other camera (a point at no distance) to the direction itself (infinitely far).
+    Poses are ``world_from_cam``, [4, 4] or one for each direction [m, 4, 4].
+    """
+    far, seen = (
+        (pose[..., :3, :3] @ direction[:, :, None])[:, :, 0]
+        for pose, direction in ((first, in_first), (second, in_second))
+    )
+    baseline = first[..., :3, 3] - second[..., :3, 3]
+    length = np.linalg.norm(baseline, axis=-1, keepdims=True)
+    near = np.broadcast_to(baseline / np.maximum(length, 1e-300), far.shape)
+    normal = np.cross(near, far)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    across = (seen * normal).sum(axis=1)
+    along = seen - across[:, None] * normal
+    beside = ((np.cross(near, along) * normal).sum(axis=1) >= 0) & (
+        (np.cross(along, far) * normal).sum(axis=1) >= 0
+    )
+    on_arc = np.arcsin(np.clip(np.abs(across), 0.0, 1.0))
+    to_far = _angle(seen, far)
+    found = np.where(beside, on_arc, np.minimum(to_far, _angle(seen, near)))
+    return np.where(length[..., 0] > 0, found, to_far)
+
+
+def _angle(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.arccos(np.clip((a * b).sum(axis=1), -1.0, 1.0))
