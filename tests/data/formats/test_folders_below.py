@@ -74,14 +74,26 @@ def test_photos_in_a_folder_beside_that_of_a_transforms_file_are_found(tmp_path,
     assert next(name for name, _ in look_at(file).files) == "nerfstudio/transforms.json"
 
 
+def test_who_names_the_folder_of_the_poses_alone_is_told_of_the_photos_beside_it(tmp_path):
+    document = nerfstudio_scene(tmp_path / "nerfstudio")
+    (tmp_path / "nerfstudio/images").rename(tmp_path / "resized_images")
+    save(tmp_path / "nerfstudio", document)
+    with pytest.raises(InputError) as caught:
+        read_dataset(tmp_path / "nerfstudio")
+    assert (caught.value.code, caught.value.where) == ("image_missing", "transforms.json frames[0].file_path")
+    assert "lies in resized_images, beside nerfstudio: give the folder above both" in caught.value.hint
+
+
 def test_no_photo_above_the_folder_of_an_upload_is_looked_at(tmp_path):
     document = nerfstudio_scene(tmp_path / "of_another")
+    (tmp_path / "of_another/images").rename(tmp_path / "images")
     place = tmp_path / "upload"
     place.mkdir()
     file = save(place, document)
     with pytest.raises(InputError) as caught:
         read_dataset(file, place)
     assert caught.value.code == "image_missing"
+    assert "beside" not in caught.value.hint
 
 
 def test_a_result_that_lies_in_the_set_is_not_taken_for_its_poses(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import posixpath
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -63,8 +64,12 @@ def find_photos(
         listed = (
             f"{len(missing)} of {len(entries)} images not found: {few_names(one.name for one in missing)}"
         )
-        hint = "Put the images there (paths are relative to the file), or remove their frames."
-        error = InputError("image_missing", f"{listed}.", where=f"{missing[0].where}.file_path", hint=hint)
+        error = InputError(
+            "image_missing",
+            f"{listed}.",
+            where=f"{missing[0].where}.file_path",
+            hint=_where(file, missing[0], within),
+        )
         tolerate(len(missing), len(entries), error, strict=strict)
         notes.append(f"{listed}; their frames are left out")
     pairs = [
@@ -76,6 +81,19 @@ def find_photos(
     first_uses = [attempt(partial(_used_once, pair, places)) for pair in pairs]
     once, _, twice = good_frames(first_uses, [entry.name for _, entry in pairs], strict=strict)
     return once, [*nameless, *notes, *twice]
+
+
+def _where(file: Path, missing: PoseEntry, within: Path | None) -> str:
+    """A hint on where the photos may be: some programs keep them in a folder beside the file's."""
+    name = posixpath.basename(_plain(missing.name))
+    if within is None:
+        with suppress(
+            OSError, StopIteration
+        ):  # a name that no file can have, or a folder that may not be read
+            folders = sorted(folder for folder in file.resolve().parent.parent.iterdir() if folder.is_dir())
+            beside = next(folder for folder in folders if (folder / name).is_file())
+            return f"{name} lies in {beside.name}, beside {file.resolve().parent.name}: give the folder above both."
+    return "Put the images there (paths are relative to the file), or remove their frames."
 
 
 def _plain(name: str) -> str:
