@@ -237,6 +237,6 @@ def _notes(root: Path, found: Sequence[_Found]) -> tuple[str, ...]:
     names = dict.fromkeys(one.place.relative_to(root).as_posix() for one in found)
     read, *others = ("the folder itself" if name == "." else name for name in names)
     if not others:
-        return (f"{read} was read",) if root not in (found[0].root, found[0].place) else ()
+        return (f"poses were read from {read}",) if root not in (found[0].root, found[0].place) else ()
     were = "was not" if len(others) == 1 else "were not"
     return (f"{read} was read and {few_names(others, 12)} {were}",)

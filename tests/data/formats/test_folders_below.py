@@ -22,7 +22,7 @@ def test_a_colmap_model_is_found_in_any_folder(tmp_path, place):
     dataset = read_dataset(tmp_path)
     assert_at_truth(dataset)
     assert dataset.root == tmp_path
-    assert place.startswith("sparse") or f"{place} was read" in dataset.warnings
+    assert place.startswith("sparse") or f"poses were read from {place}" in dataset.warnings
 
 
 def test_the_numbered_model_with_most_images_is_read_and_the_others_are_counted(tmp_path):
