@@ -57,7 +57,8 @@ async def measure(folder: Path, asked: argparse.Namespace) -> dict[str, Any]:
                 some = jobs[:spread_over]
                 heard = await parts.listeners(calls, process, database, some, asked.listeners, asked.seconds)
                 tell(f"listeners to {spread_over}", heard)
-            tell("an hour", await parts.an_hour(calls, process, jobs, dataset, asked.requests))
+            hour = await parts.an_hour(calls, process, jobs, dataset, asked.requests, 60 * asked.minutes)
+            tell("an hour", hour)
             await database.fetch("UPDATE jobs SET state = 'cancelled' WHERE state = 'queued'")
             for row in await database.fetch("SELECT id FROM queue_entries WHERE state = 'todo'"):
                 async with database.transaction() as connection:
@@ -95,6 +96,7 @@ def main() -> int:
     parser.add_argument("--listeners", type=int, default=500)
     parser.add_argument("--seconds", type=float, default=20.0, help="Of changes to be heard.")
     parser.add_argument("--requests", type=int, default=36_000, help="An hour's, at ten a second.")
+    parser.add_argument("--minutes", type=float, default=0.0, help="That these take; 0: as fast as they go.")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--dispatched", type=int, default=100)
     parser.add_argument("--output", type=Path, default=Path("load.json"))

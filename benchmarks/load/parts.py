@@ -206,8 +206,10 @@ async def _poll_jobs(calls: Calls, jobs: list[str]) -> None:
         await asyncio.sleep(0.1)
 
 
-async def an_hour(calls: Calls, process: Process, jobs: list[str], dataset: str, requests: int) -> Figures:
-    """As many requests as a busy hour has, of every kind; memory as they go by."""
+async def an_hour(
+    calls: Calls, process: Process, jobs: list[str], dataset: str, requests: int, seconds: float
+) -> Figures:
+    """As many requests as a busy hour has, of every kind, as fast as they go or within `seconds`; memory meanwhile."""
     chance, memory = random.Random(2), [process.mib()]
 
     async def one() -> None:
@@ -234,14 +236,18 @@ async def an_hour(calls: Calls, process: Process, jobs: list[str], dataset: str,
             return
         await calls(name, method, path, **({"json": body} if body else {}))
 
-    began, tenth, cpu = time.perf_counter(), max(1, requests // 10), process.cpu_s()
-    for _ in range(10):
-        await at_once(8, [one for _ in range(tenth)])
-        memory.append(process.mib())
+    pieces = 10 * max(1, round(seconds / 10))
+    each = max(1, requests // pieces)
+    began, cpu = time.perf_counter(), process.cpu_s()
+    for done in range(1, pieces + 1):
+        await at_once(8, [one for _ in range(each)])
+        if done % (pieces // 10) == 0:
+            memory.append(process.mib())
+        await asyncio.sleep(max(0.0, began + done * seconds / pieces - time.perf_counter()))
     return {
-        "requests": 10 * tenth,
-        "per_s": round(10 * tenth / (time.perf_counter() - began), 1),
-        "cpu_ms_of_the_api_each": round(1000 * (process.cpu_s() - cpu) / (10 * tenth), 2),
+        "requests": pieces * each,
+        "per_s": round(pieces * each / (time.perf_counter() - began), 1),
+        "cpu_ms_of_the_api_each": round(1000 * (process.cpu_s() - cpu) / (pieces * each), 2),
         "memory_mib": memory,
     }
 
