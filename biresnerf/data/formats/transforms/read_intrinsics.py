@@ -270,6 +270,9 @@ def _focal(fields: Fields, keys: tuple[str, str, str], size: int) -> tuple[float
         else:
             angle = value if key == keys[1] else math.radians(value)
             fits = 0.0 < angle < math.pi
+            if key == keys[2] and 0.0 < value < math.pi:
+                hint = f"{keys[2]} is in degrees; give radians as {keys[1]}, or pixels as {keys[0]}."
+                raise fields.invalid(key, f"{value:g} degrees are too narrow: it looks like radians.", hint)
             focal = 0.5 * size / math.tan(0.5 * angle) if fits else 0.0
         if not fits or not 1e-3 * size < focal < 1e5 * size:
             what = "a focal length" if key == keys[0] else "an angle of view"

@@ -142,6 +142,7 @@ BAD = {
     "centre without focal": ("intrinsics_missing", "frames[0]", _without("fl_x", "fl_y")),
     "negative angle": ("intrinsics_invalid", "camera_angle_x", _angle(-0.7)),
     "angle in degrees": ("intrinsics_invalid", "camera_angle_x", _angle(40.0)),
+    "angle in radians": ("intrinsics_invalid", "x_fov", lambda d: d.update(x_fov=1.02)),
     "endless focal": ("intrinsics_invalid", "camera_angle_x", _angle(1e-9)),
     "wild lens": ("intrinsics_invalid", "k1", lambda d: d.update(k1=1000.0)),
     "wild tangential": ("intrinsics_invalid", "k1", lambda d: d.update(p1=50.0)),
