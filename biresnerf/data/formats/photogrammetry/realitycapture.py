@@ -12,6 +12,8 @@ from __future__ import annotations
 import csv
 import io
 import math
+from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
@@ -109,7 +111,24 @@ def parse_realitycapture(_root: Path, file: Path) -> ParsedPoses:
             where = f"{file.name} line {number}"
             name = words[name_at] if name_at < len(words) else ""
             rows.append((listed_name(name, where), where, partial(read, words, where)))
-    return parsed_rows("realitycapture", [file], rows)
+    angles = ("heading", "pitch", "roll") if with_lens else ("omega", "phi", "kappa")
+    return parsed_rows(
+        "realitycapture", [file], rows, notes=_perhaps_radians(file.name, columns, table, angles)
+    )
+
+
+def _perhaps_radians(
+    file: str, columns: list[str], table: list[list[str]], angles: Sequence[str]
+) -> list[str]:
+    """A note where no angle of the table is larger than a whole turn is in radians, and some are no small ones."""
+    with suppress(ValueError, IndexError):  # rows that cannot be read say so themselves
+        largest = max(abs(float(words[columns.index(name)])) for words in table if words for name in angles)
+        if math.pi / 4 < largest <= 2 * math.pi:
+            return [
+                f"{file}: no angle is larger than {largest:.3g}. They were read as degrees, as RealityCapture "
+                "writes them; if they are radians, multiply them by 180 / pi"
+            ]
+    return []
 
 
 class FilmLens(NamedTuple):

@@ -79,6 +79,22 @@ def test_one_bad_row_costs_one_image_its_pose(tmp_path, row, column, value, code
     assert_complete(caught.value, code, "out.csv line 3")
 
 
+def test_angles_that_may_be_radians_are_noted(tmp_path):
+    refined = made("PINHOLE")
+    write_photos(tmp_path, refined)
+    write_realitycapture(refined, tmp_path / "out.csv")
+    table, angles = (
+        table_of(tmp_path / "out.csv"),
+        [COLUMNS.index(name) for name in ("heading", "pitch", "roll")],
+    )
+    assert not any("radians" in note for note in read_dataset(tmp_path).warnings)
+    for row in table[1:]:
+        for column in angles:
+            row[column] = str(np.radians(float(row[column])))
+    save_table(tmp_path / "out.csv", table)
+    assert any("if they are radians" in note for note in read_dataset(tmp_path).warnings)
+
+
 def test_a_table_of_omega_phi_and_kappa_has_poses_and_no_lens(tmp_path):
     refined = made("SIMPLE_PINHOLE")
     write_photos(tmp_path, refined)
