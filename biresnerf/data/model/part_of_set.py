@@ -6,6 +6,7 @@ import hashlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 from biresnerf.data.model.dataset import Dataset, Frame
 from biresnerf.data.model.part_of_model import without_images
@@ -61,18 +62,20 @@ def with_frames(dataset: Dataset, frames: Sequence[Frame]) -> Dataset:
 
 
 def without_copies(dataset: Dataset, keep: Sequence[str] = ()) -> Dataset:
-    """The set without photos whose files equal an earlier one's, and a note that names them.
+    """The set without photos whose pictures are stored as an earlier one's, and a note that names them.
 
     A copy's matches with its original fit exactly, and say nothing of where anything is. Copies stay where without them
     too few photos would be left, and photos of the names ``keep`` in any case.
     """
-    size = {frame.name: frame.path.stat().st_size for frame in dataset.frames}
+    begins = {frame.name: _picture_begins(frame.path) for frame in dataset.frames}
+    size = {frame.name: frame.path.stat().st_size - begins[frame.name] for frame in dataset.frames}
     several = Counter(size.values())
     first: dict[bytes, str] = {}
     copies: dict[str, str] = {}
     for frame in sorted(dataset.frames, key=lambda frame: frame.name not in keep):
         if several[size[frame.name]] > 1:
             with frame.path.open("rb") as file:
+                file.seek(begins[frame.name])
                 original = first.setdefault(hashlib.file_digest(file, "sha256").digest(), frame.name)
             if original != frame.name and frame.name not in keep:
                 copies[frame.name] = original
@@ -88,3 +91,15 @@ def without_copies(dataset: Dataset, keep: Sequence[str] = ()) -> Dataset:
         f"{listed}. A copy's pose is its original's."
     )
     return replace(part, warnings=(*part.warnings, note))
+
+
+def _picture_begins(path: Path) -> int:
+    """Where a JPEG's picture begins, behind metadata that programs add or change; 0 in other files."""
+    with path.open("rb") as file:
+        if file.read(2) != b"\xff\xd8":
+            return 0
+        while (head := file.read(4))[:1] == b"\xff" and (length := int.from_bytes(head[2:], "big")) >= 2:
+            if head[1] == 0xDA:  # start of scan
+                return file.tell() - len(head)
+            file.seek(length - 2, 1)
+    return 0

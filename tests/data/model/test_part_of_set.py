@@ -69,6 +69,25 @@ def test_copies_of_a_photo_are_left_out_and_named(tmp_path: Path) -> None:
     assert {Path(name).stem for name in kept.names} == {"0", "2", "z", "z2"}, "what is to stay, stays"
 
 
+def test_a_photo_whose_metadata_alone_a_program_changed_is_a_copy(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    for i in range(4):
+        picture, exif = Image.fromarray(rng.integers(0, 255, (24, 32, 3), np.uint8)), Image.Exif()
+        exif[0x010F] = "a maker"
+        picture.save(tmp_path / f"{i}.jpg", exif=exif)
+    stored = (tmp_path / "1.jpg").read_bytes()
+    said = b"\xff\xfe\x00\x08edited"  # a comment behind the start of the image
+    (tmp_path / "edited.jpg").write_bytes(stored[:2] + said + stored[2:])
+    (tmp_path / "other.jpg").write_bytes(
+        stored[:-3] + b"\x00" + stored[-2:]
+    )  # another picture of the same size
+    whole = read_dataset(tmp_path)
+    part = without_copies(whole)
+    assert {Path(name).stem for name in set(whole.names) - set(part.names)} == {"edited"}
+    (note,) = set(part.warnings) - set(whole.warnings)
+    assert "edited.jpg (of 1.jpg)" in note
+
+
 def same(folder: Path, one: str, other: str) -> bool:
     return (folder / one).read_bytes() == (folder / other).read_bytes()
 
