@@ -262,11 +262,13 @@ def client_with(service: Running, key: str | None) -> httpx.Client:
 
 @pytest.fixture(scope="session")
 def closed() -> Iterator[Running]:
-    """A service that wants keys."""
-    with (
-        short_folder() as folder,
-        running_service(folder, auth="required", job_command=(sys.executable, str(PROGRAM))) as running,
-    ):
+    """A service that wants keys, and takes requests as fast as tests make them."""
+    settings = {
+        "auth": "required",
+        "key_requests_burst": 10**6,
+        "job_command": (sys.executable, str(PROGRAM)),
+    }
+    with short_folder() as folder, running_service(folder, **settings) as running:
         yield running
 
 

@@ -75,10 +75,13 @@ def test_the_time_for_a_file_grows_as_its_size(tmp_path: Path, case: Callable[[P
         folder = tmp_path / str(size)
         folder.mkdir()
         read = case(folder, size)
-        begun = time.process_time()
-        with contextlib.suppress(InputError):
-            read()
-        return time.process_time() - begun
+        took = []
+        for _ in range(3):  # other programs make a processor slower, never faster
+            begun = time.process_time()
+            with contextlib.suppress(InputError):
+                read()
+            took.append(time.process_time() - begun)
+        return min(took)
 
     assert processor_s(40_000) < 8 * processor_s(10_000) + 0.25
 

@@ -109,10 +109,13 @@ LONG = {
 def test_the_time_for_a_file_grows_as_its_size(file, case):
     def processor_s(n):
         file.write_text(LONG[case](n), "utf-8")
-        begun = time.process_time()
-        with contextlib.suppress(InputError):
-            read_json_object(file)
-        return time.process_time() - begun
+        took = []
+        for _ in range(3):  # other programs make a processor slower, never faster
+            begun = time.process_time()
+            with contextlib.suppress(InputError):
+                read_json_object(file)
+            took.append(time.process_time() - begun)
+        return min(took)
 
     assert processor_s(100_000) < 25 * processor_s(10_000) + 0.25
 
