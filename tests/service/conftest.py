@@ -260,12 +260,15 @@ def client_with(service: Running, key: str | None) -> httpx.Client:
     return httpx.Client(base_url=service.url, timeout=60.0, headers=headers)
 
 
+BURST = 10**6
+
+
 @pytest.fixture(scope="session")
 def closed() -> Iterator[Running]:
     """A service that wants keys, and takes requests as fast as tests make them."""
     settings = {
         "auth": "required",
-        "key_requests_burst": 10**6,
+        "key_requests_burst": BURST,
         "job_command": (sys.executable, str(PROGRAM)),
     }
     with short_folder() as folder, running_service(folder, **settings) as running:

@@ -11,6 +11,7 @@ import pytest
 from biresnerf.client import Client, ServiceError
 from service.http.access import UNIDENTIFIED_BURST
 from tests.service.conftest import (
+    BURST,
     Running,
     Tenant,
     client_with,
@@ -135,7 +136,7 @@ def test_metrics_are_open_only_where_everything_is(service: Running, closed: Run
 
 def test_a_keyed_answer_tells_what_is_left(tenants: tuple[Tenant, Tenant]):
     first, second = (tenants[0].http.get("/v1/info").headers for _ in range(2))
-    assert first["ratelimit-policy"] == '"key";q=500'
+    assert first["ratelimit-policy"] == f'"key";q={BURST}'
     assert second["ratelimit"].startswith('"key";r=')
 
 
