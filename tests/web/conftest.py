@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import sys
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -60,9 +61,11 @@ def browser() -> Iterator[Browser]:
 
 
 @pytest.fixture(scope="module")
-def service(browser: Browser) -> Iterator[Running]:
-    """`biresnerf up`, with the real job program. Without a browser it is not started."""
-    with short_folder() as folder, running_service(folder) as running:
+def service(browser: Browser, request: pytest.FixtureRequest) -> Iterator[Running]:
+    """`biresnerf up`, with the real job program or the module's own. Without a browser it is not started."""
+    own = request.node.get_closest_marker("jobs_by")
+    settings = {"job_command": (sys.executable, str(own.args[0]))} if own else {}
+    with short_folder() as folder, running_service(folder, **settings) as running:
         yield running
 
 

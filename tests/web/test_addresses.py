@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -12,18 +11,11 @@ import httpx
 import pytest
 from playwright.sync_api import expect
 
-from tests.service.conftest import PROGRAM, Running, finished, running_service, short_folder
+from tests.service.conftest import PROGRAM, Running, finished
 from tests.web.conftest import zip_of
 from tests.web.watched import Watched
 
-
-@pytest.fixture(scope="module")
-def service(browser: object) -> Iterator[Running]:
-    with (
-        short_folder() as folder,
-        running_service(folder, job_command=(sys.executable, str(PROGRAM))) as running,
-    ):
-        yield running
+pytestmark = pytest.mark.jobs_by(PROGRAM)
 
 
 TUS = {"Tus-Resumable": "1.0.0"}

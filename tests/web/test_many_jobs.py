@@ -6,7 +6,7 @@ import asyncio
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -15,7 +15,7 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from biresnerf.client import Client
-from tests.service.conftest import PROGRAM, Running, running_service, short_folder
+from tests.service.conftest import PROGRAM, Running
 from tests.web.watched import Watched
 from tests.workers.database.full_tables import Copies
 from workers.database.database import open_database
@@ -25,13 +25,7 @@ from workers.settings.settings import Settings
 FEW, MANY, TRIES = 20, 2000, 5
 
 
-@pytest.fixture(scope="module")
-def service(browser: object) -> Iterator[Running]:
-    with (
-        short_folder() as folder,
-        running_service(folder, job_command=(sys.executable, str(PROGRAM))) as running,
-    ):
-        yield running
+pytestmark = pytest.mark.jobs_by(PROGRAM)
 
 
 async def copy(url: str, job: str, there: int, count: int) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -11,18 +9,11 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from biresnerf.client import Client
-from tests.service.conftest import PROGRAM, Running, operator, running_service, short_folder
+from tests.service.conftest import PROGRAM, Running, operator
 from tests.web.watched import Watched
 
-
-@pytest.fixture(scope="module")
-def service(browser: object) -> Iterator[Running]:
-    """With jobs that take as long as they are told, and fail if they are told."""
-    with (
-        short_folder() as folder,
-        running_service(folder, job_command=(sys.executable, str(PROGRAM))) as running,
-    ):
-        yield running
+# With jobs that take as long as they are told, and fail if they are told.
+pytestmark = pytest.mark.jobs_by(PROGRAM)
 
 
 def row(page: Page, table: str, text: str) -> object:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
-import sys
 import time
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
@@ -17,7 +15,7 @@ from playwright.sync_api import Browser, Page, Route, expect
 
 from biresnerf.client import Client
 from tests.data.photos.video.filmed import film
-from tests.service.conftest import Running, running_service, short_folder
+from tests.service.conftest import Running
 from tests.web.conftest import check_row, drop, zip_of
 from tests.web.watched import DESKTOP, PHONE, Watched, watched_page
 
@@ -36,14 +34,8 @@ SHEET_DRAWN = """async () => {
 }"""
 
 
-@pytest.fixture(scope="module")
-def service(browser: Browser) -> Iterator[Running]:
-    """With jobs that go on until they are ended, and real ones where the given poses are to be taken."""
-    with (
-        short_folder() as folder,
-        running_service(folder, job_command=(sys.executable, str(PROGRAM))) as running,
-    ):
-        yield running
+# With jobs that go on until they are ended, and real ones where the given poses are to be taken.
+pytestmark = pytest.mark.jobs_by(PROGRAM)
 
 
 @pytest.fixture

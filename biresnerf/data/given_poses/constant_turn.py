@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.given_poses.matched_details import MatchedPair, off_by
+from biresnerf.data.model.conventions import rotation_from_quat_wxyz
 
 Array = NDArray[np.float64]
 
@@ -78,12 +79,4 @@ def _scorer(
 
 def _rotations(quaternions: Array) -> Array:
     """Rotation matrices [n, 3, 3] of quaternions (w, x, y, z) [n, 4] of any length."""
-    w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
-    return np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=-1),
-            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=-1),
-            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=-1),
-        ],
-        axis=-2,
-    )
+    return np.stack([rotation_from_quat_wxyz(each) for each in quaternions])

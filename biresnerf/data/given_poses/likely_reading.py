@@ -42,20 +42,19 @@ def borne_out(dataset: Dataset, pairs: Sequence[MatchedPair]) -> PoseQuestion | 
     rows = sorted({row for pair in pairs for row in (pair.first, pair.second)})
     given = np.stack([pose for row in rows if (pose := dataset.frames[row].world_from_cam) is not None])
 
-    def agreeing(reading: Reading) -> NDArray[np.float64]:
-        poses = dict(zip(rows, poses_read_as(given, dataset.source, reading), strict=True))
+    def agreeing(read: NDArray[np.float64]) -> NDArray[np.float64]:
+        poses = dict(zip(rows, read, strict=True))
         return np.array([_agreeing(poses[pair.first], poses[pair.second], pair) for pair in pairs])
 
-    as_given = agreeing(())
-    others = {reading: agreeing(reading) for reading in _readings(form)}
+    as_given = agreeing(given)
+    others = {one: agreeing(poses_read_as(given, dataset.source, one)) for one in _readings(form)}
     best = max(others.values(), key=lambda found: float(found.mean()))
     clearly = best.mean() - as_given.mean() >= MORE and _ahead(best, as_given) >= CLEARLY
     if not clearly:
         return None
     turn = np.eye(4)
     turn[:3, :3] = best_turn(dict(zip(rows, given, strict=True)), pairs)
-    turned = {row: pose @ turn for row, pose in zip(rows, given, strict=True)}
-    of_body = np.array([_agreeing(turned[pair.first], turned[pair.second], pair) for pair in pairs])
+    of_body = agreeing(given @ turn)
     if of_body.mean() - best.mean() >= MORE and _ahead(of_body, best) >= CLEARLY:
         return None  # poses of what carries the camera, as the run will find
     reading = next(one for one, found in others.items() if _ahead(best, found) <= AS_GOOD)

@@ -87,9 +87,8 @@ def _where(file: Path, missing: PoseEntry, within: Path | None) -> str:
     """A hint on where the photos may be: some programs keep them in a folder beside the file's."""
     name = posixpath.basename(_plain(missing.name))
     if within is None:
-        with suppress(
-            OSError, StopIteration
-        ):  # a name that no file can have, or a folder that may not be read
+        # No file can have such a name, or the folder may not be read; or nothing is there.
+        with suppress(OSError, StopIteration):
             folders = sorted(folder for folder in file.resolve().parent.parent.iterdir() if folder.is_dir())
             beside = next(folder for folder in folders if (folder / name).is_file())
             return f"{name} lies in {beside.name}, beside {file.resolve().parent.name}: give the folder above both."
