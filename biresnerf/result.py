@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from biresnerf.data.formats.codec import WriteContext
 from biresnerf.data.formats.colmap.write_binary import write_colmap_binary
-from biresnerf.data.formats.result_formats import read_result, write_exports
+from biresnerf.data.formats.result_formats import export_result, read_result
 from biresnerf.data.formats.simple.poses_json import (
     POSES,
     PoseImage,
@@ -23,13 +23,13 @@ from biresnerf.data.formats.simple.poses_json import (
     matrix_of,
     read_poses_json,
 )
-from biresnerf.data.model.refined_set import REFINED
+from biresnerf.data.model.refined_set import BODY, REFINED
 from biresnerf.data.show.history import HISTORY, read_history
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.geometry.rigid import rigid_inverse
-from biresnerf.options.formats import formats
+from biresnerf.options.formats import PosesOf, formats
 from biresnerf.report import Report, Verdict
 from biresnerf.viewer.report_html import read_report
 
@@ -106,12 +106,15 @@ class Result:
         write_colmap_binary(read_result(self.folder).model, target)
         return target
 
-    def export(self, folder: str | Path, *names: str, photos: str | Path | None = None) -> tuple[Path, ...]:
+    def export(
+        self, folder: str | Path, *names: str, photos: str | Path | None = None, poses_of: PosesOf = "camera"
+    ) -> tuple[Path, ...]:
         """Write the returned poses in further formats into `folder`, as ``biresnerf export`` does.
 
         Args:
             names: of the formats, as docs/formats.md lists them: ``"nerfstudio", "llff"``.
             photos: the input's folder, which formats that hold photos need.
+            poses_of: ``"body"``: those of what carries the camera, into the folder body/.
 
         Returns:
             the file or folder of each format.
@@ -126,10 +129,11 @@ class Result:
                 said = f"unknown format (did you mean `{near[0]}`?)." if near else "unknown format."
                 raise InputError("invalid_options", said, where=name, hint=f"There are {', '.join(known)}.")
         refined = read_result(self.folder, None if photos is None else Path(photos))
-        written, notes = write_exports(refined, Path(folder), names, WriteContext())
+        written, notes = export_result(refined, Path(folder), names, WriteContext(), poses_of)
         for note in notes:
             warnings.warn(note, stacklevel=2)
-        return tuple(Path(folder) / formats()[name].in_result for name in written)
+        target = Path(folder) / BODY if poses_of == "body" else Path(folder)
+        return tuple(target / formats()[name].in_result for name in written)
 
     def plot_cameras(self, axes: Axes | None = None) -> Axes:
         """Draw the cameras before (grey) and after (blue); needs matplotlib."""

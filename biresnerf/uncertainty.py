@@ -143,5 +143,10 @@ class InputAccuracy(FrozenModel):
         description="Standard deviation of its shift along the least certain of the known directions, in the input's "
         "unit. None where no shift is known.",
     )
+    body_from_camera_known_along: tuple[tuple[float, float, float], ...] = Field(
+        (),
+        description="Unit vectors in the axes of the body along which its shift is known, or known to be zero: three "
+        "where all of it is, none where only the turn is.",
+    )
     stated_rotation_deg: float | None = Field(None, description="As stated by an option; None: not stated.")
     stated_position: float | None = Field(None, description="As stated by an option, in the input's unit.")

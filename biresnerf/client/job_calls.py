@@ -10,7 +10,7 @@ from datetime import datetime
 from typing import Any, TypeAlias, Unpack
 
 from biresnerf.client.transport import Call, Transport, parse
-from biresnerf.options.formats import ExportName
+from biresnerf.options.formats import ExportName, PosesOf
 from biresnerf.options.refine_options import RefineOptions, parse_options
 from biresnerf.report import Report
 from biresnerf.wire.base import LABEL_LENGTH, LABELS_MOST
@@ -125,9 +125,11 @@ class JobCalls(Transport):
         """Deletes a job that is over, with its results and exports."""
         await self._ask(Call("DELETE", job_url(job_id)))
 
-    async def export(self, job_id: str, formats: Sequence[ExportName]) -> JobView:
+    async def export(
+        self, job_id: str, formats: Sequence[ExportName], *, poses_of: PosesOf = "camera"
+    ) -> JobView:
         """Has the result written in further formats; returns the job that does so, or did so before."""
-        body = NewExport(formats=list(formats)).model_dump()
+        body = NewExport(formats=list(formats), poses_of=poses_of).model_dump(exclude_defaults=True)
         return parse(await self._ask(Call("POST", f"{job_url(job_id)}/exports", json=body)), JobView)
 
     async def exports(self, job_id: str) -> list[JobView]:

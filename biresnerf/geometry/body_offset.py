@@ -8,7 +8,7 @@ from poses that other evidence gave.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import permutations, product
 
 import numpy as np
@@ -60,17 +60,26 @@ class BodyOffset:
     Attributes:
         body_from_cam: [4, 4], in the given unit; its shift is zero along directions in which it is not known.
         shift_deviation: along the least certain of the others, in the given unit; None where there are none.
+        known_along: directions in which the shift is known, or known to be zero: orthonormal columns [3, k] in the axes
+            of the body.
     """
 
     body_from_cam: Array
     shift_deviation: float | None
+    known_along: Array = field(default_factory=lambda: np.zeros((3, 0)))
 
     def then(self, further: BodyOffset | None) -> BodyOffset:
         """Both, where the first is taken back already."""
         if further is None:
             return self
         known = [each for each in (self.shift_deviation, further.shift_deviation) if each is not None]
-        return BodyOffset(self.body_from_cam @ further.body_from_cam, max(known, default=None))
+        along = np.concatenate([self.known_along, self.body_from_cam[:3, :3] @ further.known_along], axis=1)
+        basis, lengths, _ = np.linalg.svd(along, full_matrices=False)
+        return BodyOffset(
+            self.body_from_cam @ further.body_from_cam,
+            max(known, default=None),
+            basis[:, lengths > SAME] if along.shape[1] else along,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,9 +173,9 @@ class _Pair:
         """
         still = self.fit(start, np.zeros((3, 0)), turns=turns)
         price += (TURN if turns else 0) * math.log(6 * len(self.given))
-        found = [self._tie(still, price, None)]
         moved = self.fit(still.cam_from_body, np.eye(3), turns=turns)
         axes, deviation = self._told(moved, np.eye(3))
+        found = [self._tie(still, price, None, axes)]
         if 0 < axes.shape[1] < 3:
             start = moved.cam_from_body.copy()
             start[:3, 3] = start[:3, :3] @ axes @ axes.T @ start[:3, :3].T @ start[:3, 3]
@@ -174,7 +183,7 @@ class _Pair:
             deviation = self._told(moved, axes)[1]
         if axes.shape[1]:
             price += axes.shape[1] * math.log(6 * len(self.given))
-            found.append(self._tie(moved, price, deviation))
+            found.append(self._tie(moved, price, deviation, axes))
         return found
 
     def _told(self, fit: _Fit, axes: Array) -> tuple[Array, float]:
@@ -191,11 +200,12 @@ class _Pair:
         )
         return along[:, told], float(1 / certain[told].min()) if told.any() else math.inf
 
-    def _tie(self, fit: _Fit, price: float, deviation: float | None) -> Tie:
+    def _tie(self, fit: _Fit, price: float, deviation: float | None, axes: Array) -> Tie:
         body_from_cam = rigid_inverse(fit.cam_from_body)
         # The offset's length is in the unit of the fitted poses; that of the given ones is asked for.
         body_from_cam[:3, 3] *= fit.frame.scale
-        offset = None if np.array_equal(body_from_cam, np.eye(4)) else BodyOffset(body_from_cam, deviation)
+        same = np.array_equal(body_from_cam, np.eye(4))
+        offset = None if same else BodyOffset(body_from_cam, deviation, axes)
         likelihood = 2 * _likelihood(fit.turned, fit.shifted / self.spread) / SHARED_ERRORS**2
         return Tie(fit.frame, offset, fit.rotation, fit.position, fit.weight, likelihood, price)
 

@@ -90,6 +90,11 @@ class Format:
         return bool(self.in_result) and not {"input", "bounds"} & set(self.needs)
 
     @property
+    def holds_bodies(self) -> bool:
+        """Whether it holds poses without what cameras see, so that those of a robot's flange have a place in it."""
+        return "points" in self.loses and "poses" not in self.loses and "photos" not in self.needs
+
+    @property
     def on_request(self) -> bool:
         """Whether a result is written in it on request only."""
         return self.of_result and not self.always
@@ -111,6 +116,8 @@ def _declared_in(path: Path) -> Iterator[Format]:
         module = ".".join(path.relative_to(_PACKAGE).with_suffix("").parts).removesuffix(".__init__")
         yield Format(**values, module=module)
 
+
+PosesOf = Literal["camera", "body"]  # whose poses: the camera's, or those of what carries it
 
 # The formats that a result is written in on request, as a type that options and the API's schema list.
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ from pydantic import (
     model_validator,
 )
 
-from biresnerf.options.formats import ExportName
+from biresnerf.options.formats import ExportName, PosesOf
 from biresnerf.options.given_poses import PoseReading, refuse_contradictions
 from biresnerf.options.option import ONCE, Option, all_required, divided, lowered
 from biresnerf.options.presets import (
@@ -260,6 +260,13 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
     ] = Field(
         (),
         description="Further formats to write the result in; pinhole: undistorted photos with a PINHOLE model.",
+    )
+    poses_of: Annotated[PosesOf, Option("exporting", "Poses of", level="usual", changes_result=False)] = (
+        Field(
+            "camera",
+            description="body: where given poses are those of a robot's flange, a phone or another body that carries "
+            "the camera, body/ holds the poses of that body as well, in the formats of poses alone.",
+        )
     )
 
     @model_validator(mode="wrap")

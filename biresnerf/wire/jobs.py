@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Annotated, Any, Literal, TypedDict
+from typing import Annotated, Any, Literal, Self, TypedDict
 from urllib.parse import quote
 
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, model_validator
 
-from biresnerf.options.formats import ExportName
+from biresnerf.options.formats import ExportName, PosesOf, formats
 from biresnerf.options.option import ONCE
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.report import VerdictName
@@ -297,6 +297,18 @@ class NewExport(Record):
     model_config = ConfigDict(json_schema_extra={"examples": [{"formats": ["kitti", "pinhole"]}]})
 
     formats: Annotated[tuple[ExportName, ...], *ONCE] = Field(min_length=1, max_length=20)
+    poses_of: PosesOf = Field(
+        "camera",
+        description="body: into body/, the poses of the robot's flange, phone or other body whose poses the input had, "
+        "in formats of poses alone.",
+    )
+
+    @model_validator(mode="after")
+    def _of_poses_alone(self) -> Self:
+        seeing = [name for name in self.formats if not formats()[name].holds_bodies]
+        if self.poses_of == "body" and seeing:
+            raise ValueError(f"{', '.join(seeing)} would show what cameras see, not poses of a body alone")
+        return self
 
 
 def job_url(job_id: str) -> str:

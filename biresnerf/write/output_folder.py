@@ -6,7 +6,7 @@ import shutil
 from contextlib import suppress
 from pathlib import Path
 
-from biresnerf.data.model.refined_set import REFINED
+from biresnerf.data.model.refined_set import BODY, REFINED
 from biresnerf.data.photos.panoramas.cut_panoramas import PANORAMA_VIEWS
 from biresnerf.data.seeding.colmap_process import LOG
 from biresnerf.data.show.history import HISTORY
@@ -55,7 +55,18 @@ class OutputFolder:
         if not (self.path / REPORT).is_file():
             return
         written = {one.in_result for one in formats().values()}
-        written |= {REPORT, REPORT_HTML, CONFIG, HISTORY, RENDERS, REFINED, THUMBNAIL, VIEW, CONTACT_SHEET}
+        written |= {
+            REPORT,
+            REPORT_HTML,
+            CONFIG,
+            HISTORY,
+            RENDERS,
+            REFINED,
+            BODY,
+            THUMBNAIL,
+            VIEW,
+            CONTACT_SHEET,
+        }
         written |= {GEOREFERENCE, LOG, CHECKPOINT.parent.name, PANORAMA_VIEWS}
         for name in {Path(file).parts[0] for file in written if file}:
             path = self.path / name

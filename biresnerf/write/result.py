@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from biresnerf.data.formats.codec import WriteContext
 from biresnerf.data.formats.positions.known_distance import KnownDistance
-from biresnerf.data.formats.result_formats import write_result_formats
+from biresnerf.data.formats.result_formats import write_body_beside, write_result_formats
 from biresnerf.data.formats.simple.poses_json import POSES
 from biresnerf.data.formats.transforms.write_transforms import transforms_notes
 from biresnerf.data.model.atomic_file import write_text
@@ -21,6 +21,7 @@ from biresnerf.data.points.refined_points import FieldPoints, with_points_of
 from biresnerf.data.show.renders import picture_stems, write_orbit, write_pictures, write_view
 from biresnerf.data.show.view_file import THUMBNAIL, ShownPictures, ShownView, ViewFile, write_view_file
 from biresnerf.data.show.view_pictures import write_contact_sheet, write_points, write_thumbnail
+from biresnerf.geometry.body_offset import BodyOffset
 from biresnerf.geometry.similarity import Similarity
 from biresnerf.progress import Monitor, Progress
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
@@ -153,7 +154,12 @@ def write_rendered(folder: Path, stem: str, view: RenderedView, photo: NDArray[n
     return write_view(folder, stem, render=view.colour, photo=photo, depth=depth)
 
 
-def described(dataset: Dataset, world_from_cam: NDArray[np.float64], report: Report) -> RefinedSet:
+def described(
+    dataset: Dataset,
+    world_from_cam: NDArray[np.float64],
+    report: Report,
+    body_offset: BodyOffset | None = None,
+) -> RefinedSet:
     """The set at poses [n, 4, 4], with what the report says of each image."""
     return refined_set(
         dataset,
@@ -162,7 +168,26 @@ def described(dataset: Dataset, world_from_cam: NDArray[np.float64], report: Rep
         pose_sources=[image.pose_source for image in report.images],
         flags=[image.flags for image in report.images],
         uncertainty=[image.uncertainty for image in report.images],
+        body_offset=body_offset,
     )
+
+
+def _body_offset(dataset: Dataset, world_from_cam: NDArray[np.float64], report: Report) -> BodyOffset | None:
+    """What these poses have and those of the body do not; None where none was found, or the views are a panorama's.
+
+    The input's own poses had taken back what the first comparison with matches found; the adjustment tells more.
+    """
+    said = report.input_accuracy
+    if dataset.cut is not None:
+        return None
+    if (
+        said is None
+        or said.body_from_camera is None
+        or np.array_equal(world_from_cam, dataset.world_from_cam)
+    ):
+        return dataset.body_offset
+    along = np.array(said.body_from_camera_known_along, np.float64).reshape(-1, 3).T
+    return BodyOffset(np.array(said.body_from_camera), said.body_from_camera_deviation, along)
 
 
 def _write_poses(
@@ -182,11 +207,13 @@ def _write_poses(
 
     Returns the report with notes on them, and the set as written.
     """
-    refined = described(dataset, world_from_cam, report)
+    offset = _body_offset(scene.dataset, world_from_cam, report)
+    refined = described(dataset, world_from_cam, report, offset)
     refined = with_points_of(refined, dataset.source.colmap, scene.tracks, scene.images, field)
-    notes = write_result_formats(
-        refined, folder, exports, WriteContext(dataset, should_stop=monitor.should_stop)
-    )
+    context = WriteContext(dataset, should_stop=monitor.should_stop)
+    notes = write_result_formats(refined, folder, exports, context)
+    if report.options.poses_of == "body":
+        notes += write_body_beside(refined, folder, exports, context)
     notes += transforms_notes(dataset, world_from_cam)
     points = PointsReport(source=refined.points_source, count=len(refined.model.points))
     return report.model_copy(update={"points": points, "warnings": report.warnings + notes}), refined

@@ -139,7 +139,7 @@ async def export_job(job_id: JobId, caller: JobWriter, body: NewExport) -> Respo
     The response is a job of its own, which can be followed and cancelled like any other. Repeating the request
     returns the same export.
     """
-    job, new = await _derived(caller).export(job_id, body.formats)
+    job, new = await _derived(caller).export(job_id, body.formats, body.poses_of)
     return job_response(job, status=200 if job.final else 202, new=new)
 
 

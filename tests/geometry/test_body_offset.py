@@ -77,6 +77,33 @@ def test_a_shift_that_looks_like_another_frame_is_not_reported_as_known():
     assert np.abs(shift[[0, 2]]).max() < 0.1
 
 
+def test_directions_in_which_the_shift_is_known_are_named():
+    rng = np.random.default_rng(5)
+    shift = (0.6, -0.9, 0.4)
+    whole = tied(walk(14, rng), rng, offset((30, -75, 95), shift)).offset
+    assert whole is not None
+    assert whole.known_along.shape == (3, 3)
+    # A robot on a floor: it turns about its upright axis alone, along which any shift is another frame.
+    upright = np.stack([offset((0, 0, angle), centre) for angle, centre in _on_a_floor(rng)])
+    mounted = offset((120, 0, 0), shift)
+    floor = tied(upright @ mounted, rng, mounted).offset
+    assert floor is not None
+    assert floor.known_along.shape == (3, 2)
+    assert np.abs(floor.known_along[2]).max() < 0.05
+    assert abs(floor.body_from_cam[2, 3]) < 0.05
+    both = floor.then(whole)
+    assert both.known_along.shape == (3, 3)
+    np.testing.assert_allclose(both.known_along.T @ both.known_along, np.eye(3), atol=1e-12)
+    # A turn of the axes of cameras that turn in all directions: the shift is known to be zero.
+    axes = tied(walk(14, rng), rng, offset((180, 0, 0))).offset
+    assert axes is not None
+    assert (axes.shift_deviation, axes.known_along.shape) == (None, (3, 3))
+
+
+def _on_a_floor(rng: np.random.Generator) -> list[tuple[float, np.ndarray]]:
+    return [(rng.uniform(0, 360), rng.normal(size=3) * [3, 3, 0]) for _ in range(14)]
+
+
 @pytest.mark.parametrize("rig", [dome, walk])
 @pytest.mark.parametrize("count", [3, 6, 25])
 def test_noise_is_no_offset(rig, count):

@@ -7,7 +7,7 @@ from typing import Any
 
 from psycopg.types.json import Jsonb
 
-from biresnerf.options.formats import ExportName
+from biresnerf.options.formats import ExportName, PosesOf
 from biresnerf.options.refine_options import OPTIONS, STAGE_1_OPTIONS, RefineOptions, parse_options
 from biresnerf.stages import REUSABLE_STAGES, ReusableStage
 from biresnerf.wire.base import Page
@@ -116,13 +116,17 @@ class DerivedJobs(JobStore):
             copied[name] = {"prefix": target, "files": reusable[name]["files"]}
         return copied
 
-    async def export(self, job_id: str, formats: Sequence[ExportName]) -> tuple[JobView, bool]:
+    async def export(
+        self, job_id: str, formats: Sequence[ExportName], poses_of: PosesOf = "camera"
+    ) -> tuple[JobView, bool]:
         """Queue an export of the job's result in further forms; the same request finds the same export.
 
         Raises `Conflict` (``result_not_ready``; ``state_conflict``: there are no poses to export),
         `LimitReached` (``queue_full``).
         """
-        options = {"formats": sorted(set(formats))}
+        options: dict[str, Any] = {"formats": sorted(set(formats))}
+        if poses_of != "camera":
+            options["poses_of"] = poses_of
         fingerprint = fingerprint_of(f"export {job_id}", options)
         async with self._database.transaction() as connection:
             parent = await self._required(connection, job_id)

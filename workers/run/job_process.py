@@ -25,7 +25,7 @@ from pydantic import TypeAdapter
 from biresnerf.errors import InputError, Interrupted, RefinementError
 from biresnerf.frozen_model import FrozenModel
 from biresnerf.openmp import let_waiting_threads_sleep
-from biresnerf.options.formats import ExportName
+from biresnerf.options.formats import ExportName, PosesOf
 from biresnerf.options.refine_options import RefineOptions, parse_options
 from biresnerf.progress import Progress
 from biresnerf.stages import Stage
@@ -158,13 +158,16 @@ def _give_video_frames(order: Order) -> None:
 def _export(order: Order, stop: _Stop) -> None:
     """Write the result in further formats; the photos are in the input where a format needs them."""
     from biresnerf.data.formats.codec import WriteContext
-    from biresnerf.data.formats.result_formats import read_result, write_exports
+    from biresnerf.data.formats.result_formats import export_result, read_result
 
     assert order.result is not None, "every export names it"
     names = TypeAdapter(tuple[ExportName, ...]).validate_python(order.options["formats"])
     photos = order.input if any(order.input.iterdir()) else None
     refined = read_result(order.result, photos)
-    _, notes = write_exports(refined, order.output, names, WriteContext(should_stop=stop.asked.is_set))
+    poses_of = TypeAdapter(PosesOf).validate_python(order.options.get("poses_of", "camera"))
+    _, notes = export_result(
+        refined, order.output, names, WriteContext(should_stop=stop.asked.is_set), poses_of
+    )
     for note in notes:
         logging.getLogger(__name__).warning("%s", note)
 

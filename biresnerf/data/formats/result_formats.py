@@ -10,16 +10,24 @@ from biresnerf.data.formats.codec import WriteContext
 from biresnerf.data.formats.colmap.format import COLMAP
 from biresnerf.data.formats.colmap.read_model import read_colmap_model
 from biresnerf.data.formats.registry import ALL_CODECS
-from biresnerf.data.formats.simple.poses_json import POSES, PoseImage, matrix_of, read_poses_json
+from biresnerf.data.formats.simple.poses_json import (
+    POSES,
+    POSES_JSON,
+    PoseImage,
+    body_offset_of,
+    matrix_of,
+    read_poses_json,
+)
 from biresnerf.data.formats.transforms.write_transforms import TRANSFORMS
-from biresnerf.data.formats.write_each import write_each
+from biresnerf.data.formats.write_each import Writing, write_each
 from biresnerf.data.model.dataset import Dataset
-from biresnerf.data.model.refined_set import RefinedImage, RefinedSet, of_whole
+from biresnerf.data.model.refined_set import BODY, RefinedImage, RefinedSet, of_whole
 from biresnerf.data.photos.panoramas.cut_panoramas import PANORAMA_VIEWS
 from biresnerf.errors import InputError
+from biresnerf.geometry.body_offset import BodyOffset
 from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS
 from biresnerf.geometry.similarity import Similarity
-from biresnerf.options.formats import formats
+from biresnerf.options.formats import PosesOf, formats
 
 
 def write_result_formats(
@@ -65,6 +73,88 @@ def write_exports(
     writing = write_each(refined, names, lambda name: _write(refined, folder, name, context))
     writing.raise_first()
     return writing.written, writing.notes
+
+
+def export_result(
+    refined: RefinedSet, folder: Path, names: Iterable[str], context: WriteContext, poses_of: PosesOf
+) -> tuple[list[str], list[str]]:
+    """`write_exports`, or `write_body` for the poses of what carries the camera."""
+    write = write_exports if poses_of == "camera" else write_body
+    return write(refined, folder, names, context)
+
+
+def write_body(
+    refined: RefinedSet, folder: Path, names: Iterable[str], context: WriteContext
+) -> tuple[list[str], list[str]]:
+    """Writes the poses of what carries the camera into ``folder``/body: in ``names``, and as every result has them.
+
+    Returns:
+        the formats written, and notes: what is not known of the offset, and what stands for what.
+
+    Raises:
+        InputError: ``export_not_possible``: no offset is known, or a format shows what cameras see; others are written.
+    """
+    names = list(dict.fromkeys(names))
+    if seeing := [name for name in names if not formats()[name].holds_bodies]:
+        raise _not_of_body(f"{', '.join(seeing)} would show what cameras see")
+    writing = _write_bodies(refined, folder, names, context)
+    writing.raise_first()
+    return writing.written, writing.notes
+
+
+def write_body_beside(
+    refined: RefinedSet, folder: Path, exports: Iterable[str], context: WriteContext
+) -> tuple[str, ...]:
+    """The same beside a result, in the input's own format as well. Returns a note for all that cannot be written."""
+    names = list(dict.fromkeys(exports))
+    try:
+        writing = _write_bodies(
+            refined, folder, [name for name in names if formats()[name].holds_bodies], context
+        )
+    except InputError as error:
+        return (f"poses_of=body: {BODY}/ was not written: {error.detail}",)
+    notes = [f"{BODY}/{name} was not written: {error}" for name, error in writing.refused.items()]
+    if seeing := [name for name in names if not formats()[name].holds_bodies]:
+        notes.append(
+            f"{', '.join(seeing)} hold the poses of the cameras alone, as they show what cameras see."
+        )
+    return (*notes, *writing.notes)
+
+
+def _write_bodies(refined: RefinedSet, folder: Path, names: Iterable[str], context: WriteContext) -> Writing:
+    offset, dataset = refined.body_offset, context.dataset
+    if offset is None:
+        raise _not_of_body("no offset between these cameras and a body that carries them was found")
+    always = [one.name for one in formats().values() if one.always and one.name != POSES_JSON.name]
+    own = () if dataset is None else formats_given_back(dataset)
+    without = set() if dataset is not None else {TRANSFORMS.name}
+    chosen = [name for name in (*always, *own) if formats()[name].holds_bodies and name not in without]
+    target, bodies = folder / BODY, refined.of_body(offset)
+    target.mkdir(parents=True, exist_ok=True)
+    writing = write_each(bodies, (*chosen, *names), lambda name: _write(bodies, target, name, context))
+    writing.notes[:0] = half_known(offset)
+    return writing
+
+
+def half_known(offset: BodyOffset) -> list[str]:
+    """A sentence where the place of the camera on the body is not known along all directions."""
+    missing = 3 - offset.known_along.shape[1]
+    if not missing:
+        return []
+    along = "" if missing == 3 else f" along {missing} of 3 directions"
+    return [
+        f"{BODY}/: the given poses do not tell where the camera sits on the body{along}. That shift counts as zero: "
+        "where the body turned, its positions may be off by it."
+    ]
+
+
+def _not_of_body(why: str) -> InputError:
+    return InputError(
+        "export_not_possible",
+        f"{why}.",
+        where="poses_of=body",
+        hint="Poses of the body follow where poses.json has body_from_camera, in formats of poses alone, as kitti.",
+    )
 
 
 def _write(refined: RefinedSet, folder: Path, name: str, context: WriteContext) -> None:
@@ -120,6 +210,7 @@ def read_result(folder: Path, photos: Path | None = None) -> RefinedSet:
         document.points_source,
         Similarity.of(document.input_from_optimised),
         document.timestamps_s,
+        body_offset_of(document),
     )
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from biresnerf.data.model.colmap_scene import ColmapModel, no_points
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.result_model import model_at_poses, model_of_poses, with_points, with_rigs
+from biresnerf.geometry.body_offset import BodyOffset
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.geometry.similarity import Similarity
@@ -23,6 +24,7 @@ from biresnerf.uncertainty import PoseUncertainty
 # rendered views end in the radiance field.
 PointsSource = Literal["none", "given", "features", "tracks", "moved", "field"]
 REFINED = "refined"  # where a result that returns the input's poses has the refined ones
+BODY = "body"  # where a result has the poses of what carries the camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +69,7 @@ class RefinedSet:
         points_source: where the model's points come from.
         similarity: ``input_from_optimised``, which tied the poses to the caller's frame.
         timestamps_s: of the images, where the input was a trajectory with times.
+        body_offset: of the cameras from the bodies whose poses the input had; None where none was found.
     """
 
     cameras: tuple[Camera, ...]
@@ -76,6 +79,7 @@ class RefinedSet:
     points_source: PointsSource
     similarity: Similarity
     timestamps_s: tuple[float, ...] | None = None
+    body_offset: BodyOffset | None = None
 
     def __post_init__(self) -> None:
         poses = [image.world_from_cam for image in self.images]
@@ -101,6 +105,29 @@ class RefinedSet:
         """The camera that took image ``index``."""
         return self.cameras[self.images[index].camera]
 
+    def of_body(self, offset: BodyOffset) -> RefinedSet:
+        """The set with the poses of what carries the camera; without points, rigs and bounds of the cameras."""
+        cam_from_body = rigid_inverse(offset.body_from_cam)
+        images = tuple(
+            replace(
+                image,
+                world_from_cam=image.world_from_cam @ cam_from_body,
+                given=None if image.given is None else image.given @ cam_from_body,
+                uncertainty=None,
+            )
+            for image in self.images
+        )
+        poses = np.stack([image.world_from_cam for image in images])
+        names, lenses = [image.file_name for image in images], [image.camera for image in images]
+        return replace(
+            self,
+            images=images,
+            model=model_of_poses(names, self.cameras, lenses, poses),
+            image_ids=tuple(range(1, len(images) + 1)),
+            points_source="none",
+            body_offset=None,
+        )
+
 
 def refined_set(
     dataset: Dataset,
@@ -111,6 +138,7 @@ def refined_set(
     pose_sources: Sequence[str] | None = None,
     flags: Sequence[tuple[str, ...]] | None = None,
     uncertainty: Sequence[PoseUncertainty | None] | None = None,
+    body_offset: BodyOffset | None = None,
 ) -> RefinedSet:
     """The set of ``dataset`` at refined poses [n, 4, 4], without points; what is left out is unknown or none.
 
@@ -156,6 +184,7 @@ def refined_set(
         "none",
         similarity or Similarity.identity(),
         _times(dataset),
+        body_offset,
     )
 
 

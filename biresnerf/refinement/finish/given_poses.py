@@ -154,6 +154,9 @@ def accuracy_report(given: GivenPoses) -> InputAccuracy:
             "position": given.position * given.unit,
             "body_from_camera": given.offset and given.offset.body_from_cam.tolist(),
             "body_from_camera_deviation": given.offset and given.offset.shift_deviation,
+            "body_from_camera_known_along": []
+            if given.offset is None
+            else given.offset.known_along.T.tolist(),
             "stated_rotation_deg": math.degrees(given.stated[0]) or None,
             "stated_position": given.stated[1] * given.unit or None,
         }

@@ -116,6 +116,13 @@ def test_an_export_is_a_job_whose_files_stand_among_the_result(
     problem(http.post(done_job["links"]["exports"], json={"formats": ["obj"]}), 422, "invalid_request")
     problem(http.post(done_job["links"]["exports"], json={"formats": []}), 422, "invalid_request")
     problem(http.post(export["links"]["exports"], json={"formats": ["kitti"]}), 409, "state_conflict")
+    of_body = {"formats": ["kitti"], "poses_of": "body"}
+    body = http.post(done_job["links"]["exports"], json=of_body).json()
+    assert body["id"] != export["id"], "another export than that of the cameras"
+    assert body["options"] == of_body
+    finished(http, body["id"])
+    seen = http.post(done_job["links"]["exports"], json={"formats": ["pinhole"], "poses_of": "body"})
+    assert "pinhole would show what cameras see" in str(problem(seen, 422, "invalid_request"))
 
 
 def test_an_export_is_done_while_refinements_hold_and_wait_for_the_only_slot(

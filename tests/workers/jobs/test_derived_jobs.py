@@ -6,6 +6,7 @@ import json
 import sys
 from pathlib import Path
 
+import anyio
 import pytest
 
 from biresnerf.data.synthetic.scene import write_synthetic_scene
@@ -78,6 +79,8 @@ async def test_a_real_job_is_forked_and_exported(database_url: str, tmp_path: Pa
         assert (new, export.kind, export.parent) == (True, "export", first.id)
         same, new = await derived.export(first.id, ["kitti", "pinhole"])
         assert (new, same.id) == (False, export.id)
+        of_body, new = await derived.export(first.id, ["kitti"], "body")
+        assert (new, of_body.options) == (True, {"formats": ["kitti"], "poses_of": "body"})
         await over(stores, fork, tmp_path)
         stages = [e.data["stage"] for e in await stores.jobs.events(fork.id) if e.type == "stage"]
         assert "fine" in stages
@@ -89,6 +92,10 @@ async def test_a_real_job_is_forked_and_exported(database_url: str, tmp_path: Pa
         names = {item.name for item in await stores.jobs.artifacts(first.id)}
         assert {"kitti.txt", "pinhole/sparse/0/images.bin", "pinhole/images/r_0.png", "poses.json"} <= names
         assert len((await read(stores, first.id, "kitti.txt")).splitlines()) == 6
+        while not (refused := await stores.jobs.get(of_body.id)).final:
+            await anyio.sleep(0.1)
+        assert refused.error is not None
+        assert "no offset between these cameras and a body" in refused.error.detail
         assert [job.id for job in (await stores.jobs.list()).items] == [fork.id, first.id]
 
         with pytest.raises(Conflict) as caught:

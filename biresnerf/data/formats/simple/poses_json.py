@@ -17,6 +17,7 @@ from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.refined_set import PointsSource, RefinedSet
 from biresnerf.data.model.untrusted_file import read_model
 from biresnerf.frozen_model import FrozenModel
+from biresnerf.geometry.body_offset import BodyOffset
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.options.formats import Format
 from biresnerf.report import SimilarityReport
@@ -63,6 +64,21 @@ class PoseImage(FrozenModel, allow_inf_nan=False):
     )
 
 
+class BodyFromCamera(FrozenModel, allow_inf_nan=False):
+    """How the camera sits on the body (robot's flange, phone) whose poses the input had."""
+
+    matrix: Matrix = Field(
+        description="In the input's unit: world_from_cam @ inverse(matrix) are the poses of the body. Its shift is "
+        "zero along directions in which it is not known."
+    )
+    shift_deviation: float | None = Field(
+        description="Standard deviation along the least certain of the known directions; null where there are none."
+    )
+    known_along: tuple[tuple[float, float, float], ...] = Field(
+        description="Directions in which the shift is known, or known to be zero: unit vectors in the body's axes."
+    )
+
+
 class PosesDocument(FrozenModel, allow_inf_nan=False):
     """The whole file."""
 
@@ -74,6 +90,9 @@ class PosesDocument(FrozenModel, allow_inf_nan=False):
     input_from_optimised: SimilarityReport
     points_source: PointsSource
     timestamps_s: tuple[float, ...] | None = None
+    body_from_camera: BodyFromCamera | None = Field(
+        None, description="Null where no offset was found that these poses have."
+    )
 
 
 def write_poses_json(refined: RefinedSet, path: Path) -> None:
@@ -99,6 +118,7 @@ def write_poses_json(refined: RefinedSet, path: Path) -> None:
         input_from_optimised=refined.similarity.report(),
         points_source=refined.points_source,
         timestamps_s=refined.timestamps_s,
+        body_from_camera=_body_from_camera(refined.body_offset),
     )
     write_json(path, document.model_dump(), indent=1)
 
@@ -114,6 +134,25 @@ def read_poses_json(path: Path) -> PosesDocument:
         path,
         code="pose_file_invalid",
         hint="Give the poses.json of a finished result, as it was written.",
+    )
+
+
+def body_offset_of(document: PosesDocument) -> BodyOffset | None:
+    """The offset that the file holds."""
+    known = document.body_from_camera
+    if known is None:
+        return None
+    along = np.array(known.known_along, np.float64).reshape(-1, 3).T
+    return BodyOffset(matrix_of(known.matrix), known.shift_deviation, along)
+
+
+def _body_from_camera(offset: BodyOffset | None) -> BodyFromCamera | None:
+    if offset is None:
+        return None
+    return BodyFromCamera(
+        matrix=_rows(offset.body_from_cam),
+        shift_deviation=offset.shift_deviation,
+        known_along=tuple((x, y, z) for x, y, z in offset.known_along.T.tolist()),
     )
 
 
