@@ -19,10 +19,6 @@ from workers.settings.errors import Unavailable
 
 log = logging.getLogger(__name__)
 
-# Work that takes its process down is given up after so many in a row. Kills that have nothing to do with it do not hit
-# it so often; whatever shows that it goes on begins the count anew.
-LOSSES_MAX = 4
-
 # Rows of `leased`, of each tenant the longest waiting.
 _CLAIM = """
     WITH waiting AS (
@@ -86,8 +82,8 @@ class LeasedWork(ClaimedWork):
     """Work on rows that may take long: the lease of a row is renewed until it is given back or the row deleted.
 
     Their table has the columns `id`, `due_at`, `round`, and `token`, `leased_until`, `losses`: who has a row, and how
-    many were lost who had it. ``owners`` joins it, as `work`, to a `tenant`, and begins the condition of what can be
-    done. At the end what is under way is left to others.
+    many were lost in a row who had it (`losses.py`). ``owners`` joins it, as `work`, to a `tenant`, and begins the
+    condition of what can be done. At the end what is under way is left to others.
     """
 
     per_tenant: ClassVar[int]
@@ -140,8 +136,8 @@ class LeasedWork(ClaimedWork):
     async def _give_back(
         self, row: dict[str, Any], *, round_: int | None = None, wait_s: float = 0.0
     ) -> None:
-        back = f"UPDATE {self.table} SET token = NULL, leased_until = NULL, round = coalesce(%s, round),".encode()
-        back += b" due_at = now() + make_interval(secs => %s) WHERE id = %s AND token = %s"
+        back = f"UPDATE {self.table} SET token = NULL, leased_until = NULL, losses = 0,".encode()
+        back += b" round = coalesce(%s, round), due_at = now() + make_interval(secs => %s) WHERE id = %s AND token = %s"
         with contextlib.suppress(Unavailable, psycopg.Error):  # then the lease ends by itself
             await self._database.fetch(back, round_, max(wait_s, self._poll_s), row["id"], self._token)
 

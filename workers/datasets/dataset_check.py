@@ -12,7 +12,8 @@ import shutil
 import tempfile
 import time
 import uuid
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from psycopg.types.json import Jsonb
@@ -20,6 +21,7 @@ from psycopg.types.json import Jsonb
 from biresnerf.wire.datasets import CheckReport
 from biresnerf.wire.problems import JobError
 from workers.database.database import Connection, Database
+from workers.database.losses import LOSSES_MAX, LostTooOften, at_an_end, counted
 from workers.process.disk_space import EXIT_DISK
 from workers.process.memory_limits import CHECK_VARIABLE, memory_limit, memory_shares
 from workers.process.turns import Turns
@@ -40,8 +42,6 @@ CHECKS = "checks"
 IN_USE = "in-use"
 SETTLED_S = 1.0
 LOOK_S = 0.5  # between two looks at a check that another process makes
-GIVE_BACK_S = 2.0
-LOSSES_MAX = 2
 # A check may take so long: for any set, for each file, and by their bytes.
 ANY_S, FILE_S, BYTES_PER_S = 120.0, 10.0, 100e3
 FATAL = JobError(
@@ -49,6 +49,15 @@ FATAL = JobError(
     detail=f"{LOSSES_MAX} processes were lost while they checked the files.",
     hint="Look for damaged or very large files.",
 )
+
+
+@dataclass
+class Take:
+    """A dataset that this process checks, and how many of its photos it has read by now."""
+
+    dataset_id: str
+    token: uuid.UUID = field(default_factory=uuid.uuid4)
+    photos_read: int = 0
 
 
 class Checker:
@@ -63,7 +72,7 @@ class Checker:
 
     async def check(self, dataset_id: str) -> None:
         """Returns once the dataset is not ``finalizing`` any more, after our check or another process's."""
-        token = uuid.uuid4()
+        take = Take(dataset_id)
         owned = await retry_while_unavailable(
             lambda: self._database.fetch("SELECT tenant FROM datasets WHERE id = %s", dataset_id)
         )
@@ -71,13 +80,8 @@ class Checker:
             return
         while True:
             async with self._turns.turn(owned[0]["tenant"]):
-                losses = await retry_while_unavailable(lambda: self._take(dataset_id, token))
-                if losses is not None and losses >= LOSSES_MAX:
-                    await retry_while_unavailable(
-                        lambda: self._database.run(_record, dataset_id, token, FATAL)
-                    )
-                elif losses is not None:
-                    await self._check(dataset_id, token)
+                if await retry_while_unavailable(lambda: self._take(take)):
+                    await self._check(take)
             rows = await retry_while_unavailable(
                 lambda: self._database.fetch("SELECT state FROM datasets WHERE id = %s", dataset_id)
             )
@@ -94,28 +98,30 @@ class Checker:
         )
         return tuple(row["id"] for row in rows)
 
-    async def _take(self, dataset_id: str, token: uuid.UUID) -> int | None:
-        """Take or renew the lease; tells how many were lost who had it before, or none where it is another's.
+    async def _take(self, take: Take) -> bool:
+        """Take or renew the lease and write down how far the check is; whether the dataset is ours.
 
         A lease, not a lock: who is frozen or cut off loses it.
         """
         rows = await self._database.fetch(
             "UPDATE datasets SET check_token = %s, check_until = clock_timestamp() + make_interval(secs => %s),"
-            " check_losses = check_losses + (check_token IS NOT NULL AND check_token <> %s)::int"
+            " check_losses = CASE WHEN check_photos < %s THEN 0 ELSE check_losses END,"
+            " check_photos = greatest(check_photos, %s)"
             " WHERE id = %s AND state = 'finalizing'"
-            " AND (check_token = %s OR check_until IS NULL OR check_until < clock_timestamp())"
-            " RETURNING check_losses",
-            *(token, 2 * self._settings.beat_s, token, dataset_id, token),
+            " AND (check_token = %s OR check_until IS NULL OR check_until < clock_timestamp()) RETURNING id",
+            *(take.token, 2 * self._settings.beat_s, take.photos_read, take.photos_read),
+            *(take.dataset_id, take.token),
         )
-        return int(rows[0]["check_losses"]) if rows else None
+        return bool(rows)
 
-    async def _check(self, dataset_id: str, token: uuid.UUID) -> None:
+    async def _check(self, take: Take) -> None:
+        dataset_id = take.dataset_id
         rows = await retry_while_unavailable(
             lambda: self._database.fetch(
                 "SELECT key, path FROM dataset_files WHERE dataset_id = %s", dataset_id
             )
         )
-        renewing = asyncio.create_task(self._renew(dataset_id, token))
+        renewing = asyncio.create_task(self._renew(take))
         shown = shown_key(dataset_id)
         try:
             # Until the outcome is recorded: this process may be killed, or the dataset deleted, before that.
@@ -123,40 +129,58 @@ class Checker:
                 lambda: self._database.run(discard, shown, after_s=self._settings.upload_expiry_s)
             )
             files = [(row["key"], row["path"]) for row in rows]
-            outcome = await check_files(self._files, files, self._settings, shown)
+            outcome = await self._outcome(files, shown, take)
         except BaseException:  # a full disk, a shutdown: it was not the files that ended it
-            await self._give_back(dataset_id, token)
+            await at_an_end(
+                self._database,
+                "UPDATE datasets SET check_token = NULL, check_until = NULL"
+                " WHERE id = %s AND check_token = %s",
+                *(dataset_id, take.token),
+            )
             raise
         finally:
             renewing.cancel()
-        await retry_while_unavailable(lambda: self._database.run(_record, dataset_id, token, outcome))
+        await retry_while_unavailable(lambda: self._database.run(_record, take, outcome))
 
-    async def _renew(self, dataset_id: str, token: uuid.UUID) -> None:
-        while True:
+    async def _renew(self, take: Take) -> None:
+        ours = True
+        while ours:
             await asyncio.sleep(self._settings.beat_s / 2)
             with contextlib.suppress(Unavailable):  # the next time will do
-                if await self._take(dataset_id, token) is None:
-                    # Taken for lost, but only frozen or cut off. (No row where the dataset is gone.)
-                    await self._database.fetch(
-                        "UPDATE datasets SET check_losses = greatest(check_losses - 1, 0)"
-                        " WHERE id = %s AND state = 'finalizing'",
-                        dataset_id,
-                    )
-                    return
+                ours = await self._take(take)
 
-    async def _give_back(self, dataset_id: str, token: uuid.UUID) -> None:
-        with contextlib.suppress(Unavailable, TimeoutError):
-            async with asyncio.timeout(GIVE_BACK_S):
-                await self._database.fetch(
-                    "UPDATE datasets SET check_token = NULL, check_until = NULL"
-                    " WHERE id = %s AND check_token = %s",
-                    *(dataset_id, token),
-                )
+    async def _outcome(
+        self, members: Sequence[tuple[str, str]], shown: str, take: Take
+    ) -> CheckReport | JobError:
+        """Run the check program on the files, given as (key, path). Its crash or timeout rejects them too.
+
+        What pages show of a good set is stored below the key ``shown``.
+
+        Where it is killed (perhaps by the kernel, because another process took too much memory) it is tried once more.
+
+        Raises:
+            OSError: the disk is full, which says nothing about the files.
+            Unavailable: the store is away.
+        """
+        with _folder(self._settings.scratch_dir / CHECKS) as folder:
+            dataset, errors = folder / "input", folder / "log.txt"
+            await self._files.stage(members, dataset)
+            try:
+                async with counted(self._database, "datasets.check_losses", take.dataset_id):
+                    outcome, killed = await _run(dataset, errors, self._settings, take)
+                    if killed:
+                        log.warning("the check of %d files was killed; trying once more", len(members))
+                        outcome, _ = await _run(dataset, errors, self._settings, take)
+            except LostTooOften:
+                return FATAL
+            if isinstance(outcome, CheckReport):
+                made = shown_folder(dataset)
+                for path in sorted(path for path in made.rglob("*") if path.is_file()):
+                    await self._files.put_path(f"{shown}/{path.relative_to(made).as_posix()}", path)
+            return outcome
 
 
-async def _record(
-    connection: Connection, dataset_id: str, token: uuid.UUID, outcome: CheckReport | JobError
-) -> None:
+async def _record(connection: Connection, take: Take, outcome: CheckReport | JobError) -> None:
     """Write the outcome down, unless another process has the lease by now."""
     found = Jsonb(outcome.model_dump(mode="json"))
     ours = await connection.row(
@@ -164,42 +188,21 @@ async def _record(
         " check_token = NULL, check_until = NULL"
         " WHERE id = %s AND state = 'finalizing' AND check_token = %s RETURNING id",
         *(("rejected", None, found) if isinstance(outcome, JobError) else ("ready", found, None)),
-        *(dataset_id, token),
+        *(take.dataset_id, take.token),
     )
     if ours and isinstance(outcome, CheckReport):
-        await forget(connection, shown_key(dataset_id))
+        await forget(connection, shown_key(take.dataset_id))
 
 
-async def check_files(
-    files: FileStore, members: Sequence[tuple[str, str]], settings: Settings, shown: str
-) -> CheckReport | JobError:
-    """Run the check program on the files, given as (key, path). Its crash or timeout rejects them too.
-
-    What pages show of a good set is stored below the key ``shown``.
-
-    Where it is killed (perhaps by the kernel, because another process took too much memory) it is tried once more.
-
-    Raises:
-        OSError: the disk is full, which says nothing about the files.
-        Unavailable: the store is away.
-    """
-    parent = settings.scratch_dir / CHECKS
+@contextlib.contextmanager
+def _folder(parent: Path) -> Iterator[Path]:
+    """A folder that nobody sweeps away while this process lives."""
     parent.mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(dir=parent))
     lock = (folder / IN_USE).open("w")
     try:
         fcntl.flock(lock, fcntl.LOCK_EX)  # the kernel frees it, however we die
-        dataset = folder / "input"
-        await files.stage(members, dataset)
-        outcome, killed = await _run(dataset, folder / "log.txt", settings)
-        if killed:
-            log.warning("the check of %d files was killed; trying once more", len(members))
-            outcome, _ = await _run(dataset, folder / "log.txt", settings)
-        if isinstance(outcome, CheckReport):
-            made = shown_folder(dataset)
-            for path in sorted(path for path in made.rglob("*") if path.is_file()):
-                await files.put_path(f"{shown}/{path.relative_to(made).as_posix()}", path)
-        return outcome
+        yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
         lock.close()
@@ -223,15 +226,26 @@ def _enough_s(dataset: Path) -> float:
     return ANY_S + FILE_S * len(sizes) + sum(sizes) / BYTES_PER_S
 
 
-async def _run(dataset: Path, errors: Path, settings: Settings) -> tuple[CheckReport | JobError, bool]:
+def _photos_read(said: bytes) -> int:
+    """What a line of the program says of its progress; 0 if it is about something else."""
+    with contextlib.suppress(ValueError, TypeError, KeyError):
+        return int(json.loads(said)["photos_read"])
+    return 0
+
+
+async def _run(
+    dataset: Path, errors: Path, settings: Settings, take: Take
+) -> tuple[CheckReport | JobError, bool]:
     """The outcome, and whether a signal ended the program. Raises `OSError` where it found no room to write."""
     memory = memory_shares(memory_limit(), settings.processes).check
     variables = {"OMP_NUM_THREADS": "1", CHECK_VARIABLE: str(memory)}
     child = await Child.start(settings.check_command, dataset, errors, variables, CHECK_NICE)
+    output = b""
     limit_s = min(settings.check_timeout_s, await asyncio.to_thread(_enough_s, dataset))
     try:
         async with asyncio.timeout(limit_s):
-            output = b"".join([line async for line in child.lines()])
+            async for output in child.lines():  # the last line is the answer
+                take.photos_read = max(take.photos_read, _photos_read(output))
             status = await child.wait()
     except TimeoutError:
         detail = f"The check took longer than {limit_s:.4g} s."

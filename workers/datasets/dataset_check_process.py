@@ -1,9 +1,9 @@
 """The program that validates a dataset: `python -m workers.datasets.dataset_check_process FOLDER`.
 
-Writes one line of JSON to standard output: ``{"report": {...}}`` (exit status 0), or ``{"error": a fault}``
-(exit status 2), and leaves in a folder beside it what pages show of the set. Exits with `EXIT_DISK` where it finds no
-room to write. It reads what strangers sent, so it confines itself first: memory, CPU time, size of files. Loads neither
-torch nor pycolmap; poses that are missing are found by the job, not here.
+Writes lines of JSON to standard output: ``{"photos_read": n}`` after each photo, and at the end ``{"report": {...}}``
+(exit status 0) or ``{"error": a fault}`` (exit status 2). Leaves in a folder beside it what pages show of the set.
+Exits with `EXIT_DISK` where it finds no room to write. It reads what strangers sent, so it confines itself first:
+memory, CPU time, size of files. Loads neither torch nor pycolmap; poses that are missing are found by the job.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import json
 import os
 import resource
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +28,16 @@ FILE_BYTES = 64 * 2**20
 
 def main(folder: Path) -> int:
     """Check ``folder``; returns the exit status."""
-    answer_to = os.dup(1)
+    out = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # whatever a library prints must not mix with the answer
+
+    def told(**said: object) -> None:
+        out.write(json.dumps(said) + "\n")
+
     try:
-        answer: dict[str, Any] = {"report": check(folder, shown_folder(folder))}
+        answer: dict[str, Any] = {
+            "report": check(folder, shown_folder(folder), lambda count: told(photos_read=count))
+        }
         status = 0
     except MemoryError:
         detail = f"The check needs more than the {_memory_bytes() // 2**20} MiB that it may take."
@@ -45,13 +52,16 @@ def main(folder: Path) -> int:
         where = error.where.replace(f"{folder}/", "").replace(str(folder), "the dataset")
         answer = {"error": error.fault.model_copy(update={"where": where}).model_dump()}
         status = EXIT_INPUT_ERROR
-    with os.fdopen(answer_to, "w") as out:
-        out.write(json.dumps(answer) + "\n")
+    told(**answer)
     return status
 
 
-def check(folder: Path, shown: Path) -> dict[str, Any]:
+def check(
+    folder: Path, shown: Path, on_photo: Callable[[int], object] = lambda _count: None
+) -> dict[str, Any]:
     """Read everything in ``folder`` and decode every image; returns what was found, and writes ``shown`` for pages.
+
+    ``on_photo`` is called with the number of photos read so far, after each.
 
     Raises:
         InputError: what is wrong, with which file, and a hint.
@@ -65,7 +75,7 @@ def check(folder: Path, shown: Path) -> dict[str, Any]:
 
     sent = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
     dataset = read_dataset(folder, within=folder)
-    images = load_images(dataset, small_side(len(dataset)))
+    images = load_images(dataset, small_side(len(dataset)), on_photo=on_photo)
     question = pose_question(dataset)
     write_shown(dataset, images, folder, sent, shown, question.given_poses if question else ())
     posed = int(dataset.posed.sum())

@@ -19,8 +19,9 @@ from psycopg.types.json import Jsonb
 
 from biresnerf import __version__
 from biresnerf.errors import FaultError
-from workers.database.claimed_work import LOSSES_MAX, LeasedWork
+from workers.database.claimed_work import LeasedWork
 from workers.database.database import Database
+from workers.database.losses import LOSSES_MAX
 from workers.database.notifications import Listener
 from workers.datasets.uploads import PIECE_MAX_BYTES, UploadStore, require_size
 from workers.jobs.quotas import require_byte_quota

@@ -6,7 +6,6 @@ wins. Counted bytes survive a failure of connection, process or host: none are h
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import secrets
 import uuid
@@ -17,13 +16,13 @@ from psycopg.types.json import Jsonb
 from biresnerf.errors import InputError
 from biresnerf.wire.datasets import FileAddress, UploadKind, UploadState
 from biresnerf.wire.problems import JobError
-from workers.database.claimed_work import LOSSES_MAX
 from workers.database.database import Connection, Database, OwnedStore
 from workers.database.ids import new_id
+from workers.database.losses import LOSSES_MAX, LostTooOften, at_an_end, counted
 from workers.datasets.dataset_rows import MINE, file_key, require_open
 from workers.jobs.quotas import require_byte_quota
 from workers.records import Upload, record_from_row
-from workers.settings.errors import Conflict, LimitReached, NotFound, Unavailable
+from workers.settings.errors import Conflict, LimitReached, NotFound
 from workers.settings.settings import Settings
 from workers.store.files import FileStore
 from workers.store.trash import discard
@@ -34,7 +33,6 @@ PIECES_BYTES = 256 * 2**20
 PIECE_MAX_BYTES = 4 * 2**20
 PIECE_MIN_BYTES = 2**18
 EXPIRE_BATCH = 100
-GIVE_BACK_S = 2.0
 
 _NEVER_STORED = JobError(
     code="storage_unavailable",
@@ -242,41 +240,28 @@ class UploadStore(OwnedStore):
 
     @contextlib.asynccontextmanager
     async def unpacking(self, upload_id: str | None) -> AsyncIterator[None]:
-        """While inside, the upload may take this process down: one that ends here is counted.
-
-        Who leaves, however it went, ends the count: only losses in a row tell. Raises `InputError`
-        (``validation_resources``) after `LOSSES_MAX`.
-        """
-        rows = await self._database.fetch(
-            "UPDATE uploads SET losses = losses + 1 WHERE id = %s RETURNING losses", upload_id
-        )
-        if rows and rows[0]["losses"] > LOSSES_MAX:
+        """Around the unpacking, which may take this process down: `InputError` if it took too many."""
+        try:
+            async with counted(self._database, "uploads.losses", upload_id):
+                yield
+        except LostTooOften:
             detail = f"{LOSSES_MAX} processes were lost while they unpacked the archive."
             hint = "Check for damaged or very large files."
-            raise InputError("validation_resources", detail, hint=hint)
-        try:
-            yield
-        finally:
-            await self._at_an_end("UPDATE uploads SET losses = 0 WHERE id = %s", upload_id)
+            raise InputError("validation_resources", detail, hint=hint) from None
 
     async def give_back(self, upload_id: str, token: uuid.UUID, *, failed: bool) -> None:
         """Give the lease back; after a failure `not_imported` names the upload again after half of its age.
 
         At the latest after a quarter of an hour; who asks for it may take it at once.
         """
-        await self._at_an_end(
+        await at_an_end(
+            self._database,
             "UPDATE uploads SET take_token = NULL, take_until = CASE WHEN %s THEN"
             " clock_timestamp() + least(interval '15 min', greatest(interval '10 s',"
             " (clock_timestamp() - expires_at + make_interval(secs => %s)) / 2)) END"
             " WHERE id = %s AND state = 'received' AND take_token = %s",
             *(failed, self._settings.upload_expiry_s, upload_id, token),
         )
-
-    async def _at_an_end(self, statement: str, *values: object) -> None:
-        """Perhaps of the process, which waits for no database that is away."""
-        with contextlib.suppress(Unavailable, TimeoutError):
-            async with asyncio.timeout(GIVE_BACK_S):
-                await self._database.fetch(statement, *values)
 
     async def conclude(self, upload_id: str, token: uuid.UUID, error: JobError | None) -> None:
         """``received`` becomes ``stored``, or ``rejected`` with the error; the pieces go to the trash."""

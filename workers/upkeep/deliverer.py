@@ -13,8 +13,9 @@ from urllib.parse import urlsplit
 
 from biresnerf import __version__
 from biresnerf.wire.problems import JobError
-from workers.database.claimed_work import LOSSES_MAX, LeasedWork
+from workers.database.claimed_work import LeasedWork
 from workers.database.database import Database
+from workers.database.losses import LOSSES_MAX
 from workers.database.notifications import Listener
 from workers.jobs.deliveries import DUE, lock_for_delivery, note_delivery
 from workers.jobs.jobs import JobStore

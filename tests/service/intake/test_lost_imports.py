@@ -21,7 +21,7 @@ from tests.workers.conftest import (
     quick_settings,
     server,
 )
-from workers.database.claimed_work import LOSSES_MAX
+from workers.database.losses import LOSSES_MAX
 from workers.engine import Stores, open_stores
 from workers.records import Upload
 from workers.settings.settings import Settings

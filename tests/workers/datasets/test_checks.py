@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import sys
-import uuid
 from pathlib import Path
 
 import pytest
@@ -12,7 +11,9 @@ import pytest
 from biresnerf.wire.datasets import DatasetView
 from tests.workers.conftest import ACCEPTED, SHORT_STALL, environment, quick_settings
 from tests.workers.datasets.test_datasets import chunks
+from workers.database.losses import LOSSES_MAX
 from workers.datasets import dataset_check
+from workers.datasets.dataset_check import Take
 from workers.engine import Stores, open_stores
 from workers.process.disk_space import EXIT_DISK
 from workers.settings.settings import Settings
@@ -190,48 +191,82 @@ async def test_a_check_that_a_dead_process_began_is_taken_over(stores: Stores):
     assert (await stores.datasets.check(dataset)).state == "ready"
 
 
-async def test_a_dataset_whose_check_takes_its_process_down_twice_is_rejected(stores: Stores):
-    dataset = await finalized_dataset(stores)
-    begun_by_one_that_died = (
-        "UPDATE datasets SET check_token = gen_random_uuid(), check_until = now() - interval '1 s'"
-    )
-    checker = stores.datasets._checker
-    database = stores.jobs._database
-    await database.fetch(begun_by_one_that_died)
-    assert await checker._take(dataset, uuid.uuid4()) == 1, "the second try is made"
-    await database.fetch(begun_by_one_that_died)
-    checked = await stores.datasets.check(dataset)
-    assert checked.error is not None
-    assert (checked.state, checked.error.code) == ("rejected", "check_crashed")
-    assert "2 processes were lost" in checked.error.detail
-
-
-async def test_web_processes_that_a_check_kills_are_at_most_two(database_url: str, tmp_path: Path):
-    marks = tmp_path / "marks"
-    kills_its_parent = (
-        f"import os, signal; open({str(marks)!r}, 'a').write('x'); os.kill(os.getppid(), signal.SIGKILL)"
-    )
-    settings = checked_by(kills_its_parent, database_url, tmp_path)
-    async with open_stores(settings) as stores:
-        dataset = await finalized_dataset(stores)
-        while (await stores.datasets.get(dataset)).state == "finalizing":
-            checking = f"""
-import asyncio
+# One process after the other checks the set, until it is checked.
+CHECKING = """
+import asyncio, sys
 from workers.engine import open_stores
 from workers.settings.settings import Settings
 async def check():
     async with open_stores(Settings()) as stores:
-        await stores.datasets.check({dataset!r})
+        await stores.datasets.check(sys.argv[1])
 asyncio.run(check())
 """
+# Reads as many photos as the list says for this take, and takes its parent down; accepts the set once the list is over.
+KILLS = """
+import json, os, signal, time
+with open({marks!r}, "a+") as marks:
+    marks.seek(0)
+    take = len(marks.read())
+    marks.write("x")
+reads = {reads!r}
+if take < len(reads):
+    print(json.dumps({{"photos_read": reads[take]}}), flush=True)
+    time.sleep({beats_s})
+    os.kill(os.getppid(), signal.SIGKILL)
+"""
+
+
+async def after_kills(
+    database_url: str, folder: Path, reads: list[int], beats_s: float = 0.5
+) -> tuple[DatasetView, int]:
+    """The outcome if each check but the last takes its process down after so many photos, and the number of checks."""
+    marks = folder / "marks"
+    program = KILLS.format(marks=str(marks), reads=reads, beats_s=beats_s) + ACCEPTED
+    settings = checked_by(program, database_url, folder, beat_s=0.1)
+    async with open_stores(settings) as stores:
+        dataset = await finalized_dataset(stores)
+        while (await stores.datasets.get(dataset)).state == "finalizing":
             process = await asyncio.create_subprocess_exec(
-                sys.executable, "-c", checking, env=environment(settings)
+                *(sys.executable, "-c", CHECKING, dataset), env=environment(settings)
             )
             await process.wait()
-        error = (await stores.datasets.get(dataset)).error
-    assert error is not None
-    assert error.code == "check_crashed"
-    assert marks.read_text() == "xx"
+        return await stores.datasets.get(dataset), len(marks.read_text())
+
+
+async def test_a_set_that_takes_down_each_process_that_checks_it_is_rejected(
+    database_url: str, tmp_path: Path
+):
+    checked, takes = await after_kills(database_url, tmp_path, [3] * 100, beats_s=0.0)
+    assert checked.error is not None
+    assert (checked.state, checked.error.code) == ("rejected", "check_crashed")
+    assert f"{LOSSES_MAX} processes were lost" in checked.error.detail
+    assert takes == LOSSES_MAX
+
+
+async def test_a_check_that_gets_further_each_time_its_process_is_killed_is_made_again(
+    database_url: str, tmp_path: Path
+):
+    reads = [*range(1, LOSSES_MAX + 3)]
+    checked, takes = await after_kills(database_url, tmp_path, reads)
+    assert (checked.state, takes) == ("ready", len(reads) + 1)
+
+
+async def test_checks_that_get_no_further_than_one_before_are_given_up(database_url: str, tmp_path: Path):
+    checked, takes = await after_kills(database_url, tmp_path, [2, 5] + 100 * [4, 5])
+    assert checked.error is not None
+    assert (checked.state, checked.error.code) == ("rejected", "check_crashed")
+    assert LOSSES_MAX < takes <= 2 * LOSSES_MAX, "2 + LOSSES_MAX, unless the machine was too slow to note one"
+
+
+async def test_processes_that_are_lost_before_they_read_a_set_do_not_count(stores: Stores):
+    dataset = await finalized_dataset(stores)
+    for _ in range(LOSSES_MAX + 1):
+        await stores.jobs._database.fetch(
+            "UPDATE datasets SET check_token = gen_random_uuid(), check_until = now() - interval '1 s'"
+        )
+        assert await stores.datasets._checker._take(Take(dataset))
+        await stores.jobs._database.fetch("UPDATE datasets SET check_until = now() - interval '1 s'")
+    assert (await stores.datasets.check(dataset)).state == "ready"
 
 
 @pytest.mark.parametrize("how", ["a full disk", "a shutdown", "a frozen process"])
@@ -242,6 +277,7 @@ async def test_what_ends_a_check_and_is_not_the_files_fault_is_no_loss(
     settings = checked_by(program, database_url, tmp_path)
     async with open_stores(settings) as stores:
         dataset, database = await finalized_dataset(stores), stores.jobs._database
+        await database.fetch("UPDATE datasets SET check_losses = %s", LOSSES_MAX - 1)
         running = asyncio.create_task(stores.datasets.check(dataset))
         if how == "a full disk":
             with pytest.raises(OSError, match="no room"):
@@ -250,12 +286,8 @@ async def test_what_ends_a_check_and_is_not_the_files_fault_is_no_loss(
             await asyncio.sleep(0.02)
         if how == "a frozen process":  # another took the dataset, for it seemed to be dead; now it goes on
             await database.fetch(
-                "UPDATE datasets SET check_token = gen_random_uuid(), check_losses = check_losses + 1,"
-                " check_until = now() + interval '1 h'"
+                "UPDATE datasets SET check_token = gen_random_uuid(), check_until = now() + interval '1 h'"
             )
-            while (await database.fetch("SELECT check_losses FROM datasets"))[0]["check_losses"]:
-                await asyncio.sleep(0.05)
-            await database.fetch("UPDATE datasets SET check_token = NULL, check_until = NULL")
         running.cancel()
         await asyncio.wait([running])
-        assert await stores.datasets._checker._take(dataset, uuid.uuid4()) == 0
+        assert (await database.fetch("SELECT check_losses FROM datasets"))[0]["check_losses"] == 0

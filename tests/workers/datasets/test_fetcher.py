@@ -15,7 +15,7 @@ from biresnerf.wire.datasets import FileAddress
 from tests.workers.datasets.file_server import FileServer
 from tests.workers.webhooks.conftest import dispatchers, settings
 from tests.workers.webhooks.webhook_receiver import PATIENCE_S, Dispatchers, until
-from workers.database.claimed_work import LOSSES_MAX
+from workers.database.losses import LOSSES_MAX
 from workers.datasets import fetcher
 from workers.datasets.uploads import PIECE_MAX_BYTES
 from workers.engine import Stores, open_stores

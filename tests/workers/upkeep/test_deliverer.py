@@ -21,7 +21,7 @@ from biresnerf.wire.jobs import JobView
 from tests.workers.conftest import Slots, ready_dataset
 from tests.workers.webhooks.conftest import dispatchers, settings
 from tests.workers.webhooks.webhook_receiver import PATIENCE_S, Dispatchers, Receiver
-from workers.database.claimed_work import LOSSES_MAX
+from workers.database.losses import LOSSES_MAX
 from workers.engine import Stores
 from workers.records import Artifact
 from workers.settings.errors import Conflict
@@ -176,6 +176,23 @@ async def test_what_a_killed_dispatcher_was_sending_is_sent_by_the_next_and_loss
             connection.execute(lost, (uuid.uuid4(), LOSSES_MAX - 1))
         said = (await over(stores, job))["log.txt"].error
         assert (said.code, len(receiver.messages)) == ("delivery_failed", 2)
+
+
+async def test_a_try_that_fails_and_costs_no_process_ends_the_count_of_losses(
+    stores: Stores, settings: Settings, slots: Slots, dispatchers: Dispatchers
+):
+    database = stores.uploads._database
+    async with Receiver(b"503 Busy", b"200 OK").open() as receiver:
+        job = await submitted(stores, DeliverTo(archive=receiver.url))
+        await database.fetch("UPDATE job_deliveries SET losses = %s", LOSSES_MAX - 1)
+        dispatchers.start()
+        slots.start(settings, "cpu0")
+        seen = set()
+        while rows := await database.fetch("SELECT losses FROM job_deliveries"):
+            seen |= {row["losses"] for row in rows}
+            await asyncio.sleep(0.01)
+        assert (await over(stores, job))[None].state == "delivered"
+    assert seen == {LOSSES_MAX - 1, 0}
 
 
 async def test_a_deleted_job_sends_nothing_and_an_export_has_no_files_of_its_own(

@@ -49,7 +49,7 @@ CREATE TABLE api_keys (
 );
 
 -- `check_token`, `check_until`: who checks the dataset, and until when without a sign of life. `check_losses`: how many
--- processes were lost while they checked it: one that takes them down is not checked for ever.
+-- processes in a row were lost while they read it and got no further; `check_photos`: by how many photos one got furthest.
 -- `expires_at` is kept up to date by the dispatcher, which alone deletes by it; null is never.
 CREATE TABLE datasets (
     id text PRIMARY KEY,
@@ -64,6 +64,7 @@ CREATE TABLE datasets (
     check_token uuid,
     check_until timestamptz,
     check_losses int NOT NULL DEFAULT 0,
+    check_photos int NOT NULL DEFAULT 0,
     created_at timestamptz NOT NULL DEFAULT clock_timestamp(),
     touched_at timestamptz NOT NULL DEFAULT clock_timestamp(),
     expires_at timestamptz,
@@ -135,7 +136,7 @@ CREATE TABLE upload_pieces (
 
 -- Uploads that a dispatcher is to fetch. `url` is a secret: the row goes once all bytes are here, or none will be.
 -- `size`: as announced. `etag`: what the pieces so far are of. `round`: tries in a row that brought little.
--- `token`, `leased_until`: who fetches it; `losses`: how many were lost who did.
+-- `token`, `leased_until`: who fetches it; `losses`: how many in a row were lost who did and brought nothing.
 CREATE TABLE upload_fetches (
     id text PRIMARY KEY REFERENCES uploads ON DELETE CASCADE,
     url text NOT NULL,
@@ -264,8 +265,7 @@ CREATE INDEX jobs_fixed ON jobs (fixed_from) WHERE fixed_from IS NOT NULL;
 -- 187 ms without these two indexes, 9 ms each with them.
 CREATE INDEX jobs_stored ON jobs (tenant) INCLUDE (stored_bytes);
 CREATE INDEX jobs_of_state ON jobs (state);
--- So that rounds of upkeep read what changed and lists read what they show, not all jobs that ever were: measured by
--- `python -m benchmarks.service.full_tables` (docs/scaling.md).
+-- So that rounds of upkeep read what changed and lists read what they show, not all jobs that ever were (docs/scaling.md).
 CREATE INDEX jobs_undated ON jobs (finished_at)
     WHERE finished_at IS NOT NULL AND expires_at IS NULL AND state <> 'expired';
 CREATE INDEX jobs_with_key ON jobs (finished_at) WHERE idempotency_key IS NOT NULL;
