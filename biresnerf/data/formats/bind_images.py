@@ -22,6 +22,7 @@ from biresnerf.data.photos.photo_folders import (
     photos_beside,
     photos_named,
     refuse_no_images,
+    unused_image_notes,
     with_named,
 )
 from biresnerf.data.photos.shear import shear_notes
@@ -53,7 +54,10 @@ def bind_images(parsed: ParsedPoses, root: Path, within: Path | None = None) -> 
         notes = [note for note in notes if not any(words in note for words in EXPECTED)]
         pairs = [(name, replace(entry, name=name)) for name, entry in pairs]
     images = [(files[name], entry) for name, entry in pairs]
-    return dataset_of(root, images, parsed.source, [*parsed.notes, *notes], within, strict=parsed.strict)
+    dataset = dataset_of(root, images, parsed.source, [*parsed.notes, *notes], within, strict=parsed.strict)
+    masks = [frame.mask for frame in dataset.frames if frame.mask is not None]
+    beside = unused_image_notes([path for path, _ in images], masks) if named else []
+    return replace(dataset, warnings=(*dataset.warnings, *beside))
 
 
 def by_name(entries: Sequence[PoseEntry], names: Sequence[str], *, strict: bool = False) -> Assignment:

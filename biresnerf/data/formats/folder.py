@@ -17,6 +17,7 @@ from biresnerf.data.photos.photo_folders import (
     few_names,
     folders_of_photos,
     images_beside,
+    images_in,
     is_photo_name,
     no_images,
     photos_beside,
@@ -25,6 +26,8 @@ from biresnerf.data.photos.photo_folders import (
 from biresnerf.data.photos.video.video_frames import VIDEO_FRAMES, is_video_name
 from biresnerf.errors import InputError
 
+# Parts that sets for training are split into.
+_PARTS = frozenset({"train", "training", "test", "testing", "val", "valid", "validation", "eval"})
 # Folders that are part of the names of photos, also where there is nothing beside them.
 _NAMED_IN_SETS = (IMAGE_FOLDER, VIDEO_FRAMES)
 
@@ -156,6 +159,25 @@ def usual_name(file: Path) -> str | None:
     if contents.format is None or contents.poses != file:
         return None
     return ALL_CODECS[contents.format].format.found_as[0].replace("*", "cameras")
+
+
+def other_parts_notes(top: Path, used: Sequence[Path]) -> list[str]:
+    """A note on photos in folders of ``top`` called as parts of a set (test/, val/), where none is ``used``."""
+    taken = {parent for path in used for parent in path.absolute().parents}
+    left: dict[str, int] = {}
+    for folder, _, _ in folders_of_set(top.absolute()):
+        inside = folder.relative_to(top.absolute())
+        if _PARTS.isdisjoint(part.casefold() for part in inside.parts) or folder in taken:
+            continue
+        if photos := images_in(folder):
+            left[f"{inside.as_posix()}/"] = len(photos)
+    if not left:
+        return []
+    listed = few_names([f"{name} ({count})" for name, count in left.items()])
+    return [
+        f"photos of other parts of the set are left out: {listed}. They can join the result: with a folder of all "
+        "photos and --fixed-from OUT (over HTTP fixed_from)"
+    ]
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.formats.bind_images import dataset_of
-from biresnerf.data.formats.folder import FolderContents, look_at, look_into
+from biresnerf.data.formats.folder import FolderContents, look_at, look_into, other_parts_notes
 from biresnerf.data.formats.parsed_poses import ParsedPoses, PoseEntry, without_problems
 from biresnerf.data.formats.positions.control_points import control_files, control_notes
 from biresnerf.data.formats.positions.position_priors import position_notes
@@ -64,6 +64,9 @@ def read_dataset(
             codec.refuse_early(contents.poses, within)
         parsed = _parse(contents.format, contents.root, contents.poses)
         dataset = codec.bind(without_problems(parsed, strict=strict), contents.root, within)
+        top = Path(path) if Path(path).is_dir() else contents.root
+        parts = other_parts_notes(top, [frame.path for frame in dataset.frames])
+        contents = replace(contents, notes=(*contents.notes, *parts))
     for index, frame in enumerate(dataset.frames):
         refuse_unfit_mask(frame, dataset.camera_of(index))
     used = [

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from biresnerf.data.model.dataset import Dataset, Frame
 from biresnerf.data.model.part_of_model import without_images
@@ -14,6 +16,7 @@ from biresnerf.errors import InputError
 
 LEAST = 3  # photos that something can be made of
 MOST_NAMED = 10
+SAME = 1e-4  # rad, and a share of the set's size: poses written with few digits are the same
 
 
 def without_photos(dataset: Dataset, names: Sequence[str]) -> Dataset:
@@ -88,9 +91,31 @@ def without_copies(dataset: Dataset, keep: Sequence[str] = ()) -> Dataset:
     )
     note = (
         f"{len(copies)} of {len(dataset)} photos are copies of others, and are left out, as they tell nothing new: "
-        f"{listed}. A copy's pose is its original's."
+        f"{listed}. A copy's pose is its original's.{_other_poses(dataset, copies)}"
     )
     return replace(part, warnings=(*part.warnings, note))
+
+
+def _other_poses(dataset: Dataset, copies: Mapping[str, str]) -> str:
+    """A sentence on copies that the input gives other poses than their originals: two for one picture."""
+    pose_of = {frame.name: frame.world_from_cam for frame in dataset.frames}
+    places = np.array([pose[:3, 3] for pose in pose_of.values() if pose is not None]).reshape(-1, 3)
+    size = float(np.ptp(places, axis=0).max(initial=0.0)) if len(places) else 0.0
+    apart = []
+    for copy, original in copies.items():
+        pose, other = pose_of[copy], pose_of[original]
+        if pose is None or other is None:
+            continue
+        moved = float(np.linalg.norm(pose[:3, 3] - other[:3, 3]))
+        if moved > SAME * size or not np.allclose(pose[:3, :3], other[:3, :3], rtol=0, atol=SAME):
+            apart.append(copy)
+    if not apart:
+        return ""
+    named = ", ".join(apart[:MOST_NAMED]) + f" and {len(apart) - MOST_NAMED} more" * (len(apart) > MOST_NAMED)
+    return (
+        f" The input has other poses for {named} than for the same pictures under their other names; these were not "
+        "used. Is each file the photo that its pose was given for?"
+    )
 
 
 def _picture_begins(path: Path) -> int:

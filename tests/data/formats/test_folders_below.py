@@ -74,6 +74,27 @@ def test_photos_in_a_folder_beside_that_of_a_transforms_file_are_found(tmp_path,
     assert next(name for name, _ in look_at(file).files) == "nerfstudio/transforms.json"
 
 
+def test_photos_of_other_parts_of_a_set_and_those_without_an_entry_are_said(tmp_path):
+    """NeRF++: train/rgb with train/pose, and the photos of test/ and validation/ beside."""
+    train = tmp_path / "train"
+    for index in range(4):
+        write_image(train / "rgb" / f"{index}.png", index)
+        (train / "pose").mkdir(exist_ok=True)
+        (train / "pose" / f"{index}.txt").write_text(f"1 0 0 {index}  0 1 0 0  0 0 1 0  0 0 0 1")
+    write_image(tmp_path / "test/rgb/0.png", 7)  # called as one of the others is
+    assert not any("left out" in text for text in read_dataset(train).warnings)
+    (note,) = (text for text in read_dataset(tmp_path).warnings if "left out" in text)
+    assert "test/rgb/ (1)" in note
+    assert "--fixed-from" in note
+    write_image(tmp_path / "validation/9.png", 8)
+    write_image(train / "rgb/more.png", 9)
+    dataset = read_dataset(tmp_path)
+    assert len(dataset) == 4
+    parts, beside = (text for text in dataset.warnings if "left out" in text)
+    assert "test/rgb/ (1), validation/ (1)" in parts
+    assert beside == "1 images beside the used ones have no frame and are left out: more.png"
+
+
 def test_who_names_the_folder_of_the_poses_alone_is_told_of_the_photos_beside_it(tmp_path):
     document = nerfstudio_scene(tmp_path / "nerfstudio")
     (tmp_path / "nerfstudio/images").rename(tmp_path / "resized_images")

@@ -24,7 +24,7 @@ SETS = {
     "25_colmap_photos_in_another_folder/images_4": ("colmap", 8, 116.9192, None),
     "25_colmap_photos_in_another_folder/root_model": ("colmap", 8, 116.9192, "dense/sparse was read"),
     "26_3d_scanner_app/chair": ("3d-scanner-app", 6, None, None),
-    "27_nerfpp/scene": ("matrix-files", 8, 116.9192, "poses were read from train/pose"),
+    "27_nerfpp/scene": ("matrix-files", 8, 116.9192, "left out: test/rgb/ (3)"),
     "27_nerfpp/train_alone": ("matrix-files", 8, 116.9192, None),
     "29_other_poses_ignored/pose_csv": ("csv", 8, None, "poses.csv was read as camera to world"),
     "29_other_poses_ignored/realestate10k": ("realestate10k", 8, 116.9192, None),

@@ -88,6 +88,26 @@ def test_a_photo_whose_metadata_alone_a_program_changed_is_a_copy(tmp_path: Path
     assert "edited.jpg (of 1.jpg)" in note
 
 
+def test_a_copy_whose_pose_differs_from_its_originals_is_said(tmp_path: Path) -> None:
+    """As of a rig of which one photo was copied over another: two poses for one picture cannot both hold."""
+    trajectories.colmap_set(tmp_path)
+    first, second = (read_dataset(tmp_path).frames[row].path for row in (0, 1))
+    shutil.copy(first, second)
+    part = without_copies(whole := read_dataset(tmp_path))
+    (note,) = set(part.warnings) - set(whole.warnings)
+    assert f"other poses for {whole.names[1]} than" in note
+    pose = whole.frames[0].world_from_cam
+    assert pose is not None
+    almost = pose.copy()
+    almost[:3, 3] += 1e-7
+    frames = tuple(
+        replace(f, world_from_cam=almost if row == 1 else f.world_from_cam)
+        for row, f in enumerate(whole.frames)
+    )
+    (note,) = set(without_copies(replace(whole, frames=frames)).warnings) - set(whole.warnings)
+    assert "other poses" not in note
+
+
 def same(folder: Path, one: str, other: str) -> bool:
     return (folder / one).read_bytes() == (folder / other).read_bytes()
 
