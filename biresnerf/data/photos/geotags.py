@@ -58,6 +58,13 @@ def read_geotag(path: Path, name: str) -> MeasuredPlace | None:
     return place._replace(accuracy_m=_of_drone(text) or place.accuracy_m)
 
 
+def lacks_height(path: Path, name: str) -> bool:
+    """Whether a photo's EXIF says latitude and longitude, but no altitude. Raises InputError as `open_image`."""
+    with quiet_pillow(), open_image(path, name) as image:
+        tags = from_exif(image, lambda exif: set(exif.get_ifd(_GPS_IFD))) or set()
+    return {_LATITUDE, _LONGITUDE} <= tags and _ALTITUDE not in tags
+
+
 def _of_drone(text: bytes) -> tuple[float, float, float] | None:
     """The accuracy that a drone states, unless its RTK was off."""
     east, north, up = (xmp_number(text, *names) for names in _ACCURACY)

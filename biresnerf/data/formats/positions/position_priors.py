@@ -12,6 +12,7 @@ from biresnerf.data.formats.match_names import match_files
 from biresnerf.data.formats.photogrammetry.metashape import cameras_by_label, the_chunk
 from biresnerf.data.formats.positions.position_table import (
     EPSG,
+    FLAT,
     WGS84,
     PositionTable,
     is_geographic,
@@ -21,9 +22,11 @@ from biresnerf.data.formats.positions.position_table import (
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.measured_places import PositionPriors
 from biresnerf.data.model.untrusted_file import finite_numbers, read_text
-from biresnerf.data.photos.geotags import MeasuredPlace, read_geotag
+from biresnerf.data.photos.geotags import MeasuredPlace, lacks_height, read_geotag
 from biresnerf.errors import InputError
 from biresnerf.geometry.earth.geodesy import east_north_up, held_so
+
+FEW = 5  # photos that are opened to see whether any has a position without a height
 
 
 def position_priors(dataset: Dataset) -> PositionPriors | None:
@@ -59,8 +62,22 @@ def _tags(dataset: Dataset) -> dict[int, MeasuredPlace]:
 
 
 def position_notes(dataset: Dataset) -> tuple[str, ...]:
-    """A note on how many photos a table beside them has positions for. Raises InputError ``positions_invalid``."""
-    return _of_table(dataset)[1]
+    """Notes on how many photos a table beside them has positions for, and on photos whose own have no height.
+
+    Raises:
+        InputError: ``positions_invalid``, or a code of `open_image`.
+    """
+    table, notes = _of_table(dataset)
+    if table is not None:
+        return notes
+    frames = dataset.frames
+    # A device writes heights or does not: some photos tell whether all are to be opened.
+    some = {frames[i] for i in np.linspace(0, len(frames) - 1, FEW).astype(int).tolist()}
+    if not any(lacks_height(frame.path, frame.name) for frame in some):
+        return notes
+    flat = sum(lacks_height(frame.path, frame.name) for frame in frames)
+    note = f"{flat} of {len(frames)} photos have a GPS position without altitude, which is not used, {FLAT}"
+    return (*notes, note)
 
 
 def _of_table(dataset: Dataset) -> tuple[PositionTable | None, tuple[str, ...]]:

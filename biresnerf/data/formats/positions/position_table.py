@@ -33,6 +33,7 @@ _COLUMNS = {
     "accuracy": ("accuracy", "accuracym", "sigma", "std", "xyzaccuracy"),
     "zaccuracy": ("zaccuracy", "accuracyz", "verticalaccuracy", "sigmaz"),
 }
+FLAT = "as places alone, without heights, do not tell how the scene is tilted"
 _ODM_ACCURACY = (
     7  # column of geo.txt's horizontal accuracy, after name, position and angles; the vertical one follows
 )
@@ -83,21 +84,25 @@ def read_position_table(file: Path) -> PositionTable:
     longitudes = "xlongitude" in _plain(lines)
     degrees = "lat" in header or (longitudes and (not said.partition(":")[2] or is_geographic(said)))
     order = ("lat", "lon", "z") if "lat" in header else ("y", "x", "z") if degrees else ("x", "y", "z")
-    missing = [name for name in ("name", *order) if name not in header]
+    missing = [name for name in ("name", *order[:2]) if name not in header]
     if missing:
         raise _invalid(f"{file.name}", f"has no column for {', '.join(missing)}.")
     numbers = re.findall(EPSG, said)
     places: dict[str, MeasuredPlace] = {}
+    flat: list[int] = []
     for number, cells in rows:
         where = f"{file.name} line {number}"
-        texts = [_cell(cells, header[name]) for name in order]
+        texts = [_cell(cells, header[name]) if name in header else "" for name in order]
         name = _cell(cells, header["name"])
         if not name or not any(texts):  # Metashape lists photos without a reference, too
+            continue
+        if all(texts[:2]) and not texts[2]:
+            flat.append(number)
             continue
         accuracy = [_cell(cells, header[key]) for key in ("accuracy", "zaccuracy") if key in header]
         _add(places, name, texts, accuracy, where, degrees=degrees)
     epsg = WGS84 if degrees else int(numbers[-1]) if numbers else None
-    return PositionTable(file.name, places, degrees, epsg)
+    return PositionTable(file.name, places, degrees, epsg, _flat_notes(file.name, flat))
 
 
 def _geo_txt(source: str, lines: Sequence[str], first: int) -> PositionTable:
@@ -124,10 +129,15 @@ def _geo_txt(source: str, lines: Sequence[str], first: int) -> PositionTable:
         _add(places, cells[0], texts, stated, where, degrees=degrees)
         a, b, c = places[cells[0]].place
         places[cells[0]] = places[cells[0]]._replace(place=(a * metres, b * metres, c))
-    notes: tuple[str, ...] = ()
-    if flat:
-        notes = (f"{source} line {flat[0]} has no height: {len(flat)} positions without one are not used",)
-    return PositionTable(source, places, degrees, epsg, notes)
+    return PositionTable(source, places, degrees, epsg, _flat_notes(source, flat))
+
+
+def _flat_notes(source: str, lines: Sequence[int]) -> tuple[str, ...]:
+    if not lines:
+        return ()
+    return (
+        f"{source} line {lines[0]} has no height: {len(lines)} positions without one are not used, {FLAT}",
+    )
 
 
 def frame_of(header: str, rows: Sequence[Sequence[str]], where: str) -> tuple[bool, float, int | None]:
@@ -176,7 +186,9 @@ def _header_and_rows(
             for title in reversed(names)
             if title in titles
         }
-        if "name" in header and len(header) > 3:
+        if "name" in header and (
+            len(header) > 3 or {"lat", "lon"} <= header.keys() or {"x", "y"} <= header.keys()
+        ):
             below = list(enumerate(lines[index + 1 :], index + 2))
             told = [(number, line) for number, line in below if line.strip() and not line.startswith("#")]
             cells = csv.reader((line for _, line in told), delimiter=separator)

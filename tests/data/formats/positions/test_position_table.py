@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from biresnerf.data.formats.positions.position_priors import position_priors
 from biresnerf.data.formats.positions.position_table import is_geographic, position_files, read_position_table
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.errors import InputError
+from tests.data.photos.geotagged import geotag
 from tests.data.scenes import assert_complete, nerfstudio_scene, save
 
 DEGREES = "name,lat,lon,alt,accuracy\na.jpg,50.5,14.25,300,0.02\nb.jpg,50.6,14.26,301,\n"
@@ -70,7 +72,7 @@ def test_a_table_is_read_with_its_accuracy_and_frame(tmp_path: Path, name, text,
     ("name", "text", "where"),
     [
         ("gps.csv", "a.jpg,50,14,300\n", "gps.csv"),
-        ("gps.csv", "name,lat,lon\na.jpg,50,14\n", "gps.csv"),
+        ("gps.csv", "name,lat,alt\na.jpg,50,14\n", "gps.csv"),
         ("gps.csv", DEGREES + "c.jpg,91,14,0,1\n", "line 4"),
         ("gps.csv", DEGREES + "c.jpg,north,14,0,1\n", "line 4"),
         ("gps.csv", DEGREES + "c.jpg,nan,14,0,1\n", "line 4"),
@@ -126,7 +128,43 @@ def test_positions_without_height_are_not_used_and_the_line_is_named(tmp_path: P
     (tmp_path / "geo.txt").write_text("EPSG:4326\na.jpg 11 48 3\nb.jpg 11 48\nc.jpg 11 48\n")
     table = read_position_table(tmp_path / "geo.txt")
     assert list(table.places) == ["a.jpg"]
-    assert table.notes == ("geo.txt line 3 has no height: 2 positions without one are not used",)
+    assert table.notes == (
+        "geo.txt line 3 has no height: 2 positions without one are not used, as places alone, without heights, do not "
+        "tell how the scene is tilted",
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "flat", "known"),
+    [
+        ("name,lat,lon\na.jpg,50.5,14.25\nb.jpg,50.6,14.26\n", 2, 2, []),
+        ("name,lat,lon,alt\na.jpg,50.5,14.25,300\nb.jpg,50.6,14.26,\n", 3, 1, ["a.jpg"]),
+        ("name;x;y\na.jpg;1;2\n", 2, 1, []),
+    ],
+)
+def test_rows_of_a_table_without_height_are_said_and_do_not_refuse_the_set(tmp_path, text, line, flat, known):
+    (tmp_path / "gps.csv").write_text(text)
+    table = read_position_table(tmp_path / "gps.csv")
+    assert list(table.places) == known
+    (note,) = table.notes
+    assert note.startswith(f"gps.csv line {line} has no height: {flat} positions without one are not used")
+
+
+def test_photos_whose_gps_has_no_altitude_are_counted(tmp_path: Path):
+    scene = nerfstudio_scene(tmp_path)
+    save(tmp_path, scene)
+    assert not any("altitude" in text for text in read_dataset(tmp_path).warnings)
+    paths = [tmp_path / row["file_path"] for row in scene["frames"]]
+    for path in paths[1:]:
+        tags = geotag(50.5, 14.25, 300.0)
+        tags[0x8825] = {key: value for key, value in tags[0x8825].items() if key not in (5, 6)}
+        Image.open(path).save(path, exif=tags)
+    dataset = read_dataset(tmp_path)
+    assert position_priors(dataset) is None
+    (note,) = (text for text in dataset.warnings if "altitude" in text)
+    assert note.startswith(
+        f"{len(paths) - 1} of {len(paths)} photos have a GPS position without altitude, which is not"
+    )
 
 
 @pytest.mark.parametrize(
