@@ -136,7 +136,7 @@ def directions_with_gradient(
     _require(image_index, pixel_xy, 2)
     c = intrinsics.coefficients(image_index)
     with torch.no_grad():
-        x, y = _to_plane(intrinsics, image_index, directions.to(torch.float64))
+        x, y = plane_position(intrinsics, image_index, directions.to(torch.float64))
         jacobian = distort_jacobian(x, y, c)
     now_x, now_y = distort(x, y, c)
     to_x, to_y = _in_focal_lengths(intrinsics, image_index, pixel_xy)
@@ -158,7 +158,7 @@ def project(intrinsics: Intrinsics, image_index: Tensor, points_in_cam: Tensor) 
         ValueError: the shapes do not fit.
     """
     _require(image_index, points_in_cam, 3)
-    x, y = _to_plane(intrinsics, image_index, points_in_cam.to(torch.float64))
+    x, y = plane_position(intrinsics, image_index, points_in_cam.to(torch.float64))
     return _on_image(intrinsics, image_index, x, y).to(points_in_cam.dtype)
 
 
@@ -168,7 +168,7 @@ def in_view(intrinsics: Intrinsics, image_index: Tensor, points_in_cam: Tensor) 
     What lies farther out than all that the image shows is not in view, wherever the lens formula may fold it.
     """
     _require(image_index, points_in_cam, 3)
-    x, y = _to_plane(intrinsics, image_index, points_in_cam.to(torch.float64))
+    x, y = plane_position(intrinsics, image_index, points_in_cam.to(torch.float64))
     pixel_xy = _on_image(intrinsics, image_index, x, y)
     size = torch.stack([intrinsics.width[image_index], intrinsics.height[image_index]], 1)
     inside = ((pixel_xy > 0) & (pixel_xy < size)).all(1)
@@ -206,8 +206,8 @@ def _from_plane(i: Intrinsics, image_index: Tensor, x: Tensor, y: Tensor) -> Ten
     return torch.where(i.fisheye[image_index][:, None], fisheye, perspective)
 
 
-def _to_plane(i: Intrinsics, image_index: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
-    """The inverse of `_from_plane` for points at any distance; NaN where there is no position."""
+def plane_position(i: Intrinsics, image_index: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Positions [m], [m] on the plane of directions of points [m, 3] in the camera; NaN where there is none."""
     x, y, z = points.unbind(1)
     one, nowhere = torch.ones_like(z), torch.full_like(z, float("nan"))
     scale = torch.where(z > 0, 1 / torch.where(z > 0, z, one), nowhere)

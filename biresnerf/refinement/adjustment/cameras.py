@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 NEAR = 0.01
 POSE = 6  # unknowns of a camera
 LENS_ROW = 11  # numbers that the kernels take of a lens
+# And with 1 for a fisheye's view, and where it shows its observation by each of the lens's unknowns.
+SHOWN_ROW = LENS_ROW + 1 + 2 * LENS
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +85,10 @@ class Cameras:
         turned = so3_log(torch.from_numpy(turn)).numpy()
         poses = np.concatenate([turned, self.centre - other.centre], axis=1)
         return np.concatenate([poses.reshape(-1), (self.lens - other.lens).reshape(-1)])
+
+    def same_lenses(self, other: Cameras) -> bool:
+        """Whether lenses and what is unknown of them are the same."""
+        return np.array_equal(self.lens, other.lens) and np.array_equal(self.kinds, other.kinds)
 
     def split(self, unknowns: Array) -> tuple[Array, Array]:
         """The parts [n, 6] and [g, 8] of a vector of all unknowns."""

@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from biresnerf.geometry.camera.camera import Intrinsics, project
-from biresnerf.refinement.adjustment.cameras import LENS_ROW, Cameras
+from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam, project
+from biresnerf.refinement.adjustment.cameras import LENS_ROW, SHOWN_ROW, Cameras
+from biresnerf.refinement.adjustment.lens.fisheyes import moved_by_lens, with_corrections
 
 Array = NDArray[np.float64]
 
@@ -27,7 +28,7 @@ class TangentViews:
         of: int64 [m], the photo of each observation.
         cam_from_view: [m, 3, 3].
         fisheye: bool [m].
-        lens: [m, 11], of the fisheyes' views, as the kernels take them.
+        lens: of the fisheyes' views, as the kernels take them: [m, 11], or [m, 28] where lenses are unknown.
         xy: [m, 2], the observations in their views, px.
     """
 
@@ -39,27 +40,42 @@ class TangentViews:
 
     @classmethod
     def looking_at(
-        cls, rays: Array, xy: Array, image: NDArray[np.int64], intrinsics: Intrinsics, near: Array
+        cls, xy: Array, image: NDArray[np.int64], intrinsics: Intrinsics, near: Array, cameras: Cameras
     ) -> TangentViews:
-        """Of observations at `xy` [m, 2] of photos, whose unit rays in the camera are [m, 3].
+        """Of observations at `xy` [m, 2] of photos, as the cameras' lenses are now.
 
         Args:
+            intrinsics: of the evidence.
             near: [n], of each photo the least depth at which something is in front.
         """
+        now = with_corrections(intrinsics, cameras.lens_of, cameras.lens)
         fisheye = intrinsics.fisheye.numpy()[image]
-        turn, lens = np.tile(np.eye(3), (len(image), 1, 1)), np.zeros((len(image), LENS_ROW))
-        turn[fisheye] = _away_and_around(rays[fisheye])
-        lens[fisheye, :2] = _scales(turn[fisheye], image[fisheye], intrinsics)
+        of, at = image[fisheye], xy[fisheye]
+        unknown = bool(len(cameras.kinds))
+        turn = np.tile(np.eye(3), (len(image), 1, 1))
+        lens = np.zeros((len(image), SHOWN_ROW if unknown else LENS_ROW))
+        turn[fisheye] = _away_and_around(
+            directions_in_cam(now, torch.from_numpy(of), torch.from_numpy(at)).numpy()
+        )
+        by_slope = _photo_by_slope(turn[fisheye], of, now)
+        scale = np.linalg.norm(by_slope, axis=1)
+        lens[fisheye, :2] = scale
         lens[:, 4] = near[image]
+        if unknown:
+            view_from_photo = scale[:, :, None] * np.linalg.inv(by_slope)
+            moved = view_from_photo @ moved_by_lens(now, intrinsics, of, at)  # [m, 2, 8]
+            lens[fisheye, LENS_ROW] = 1.0
+            lens[fisheye, LENS_ROW + 1 :] = moved.transpose(0, 2, 1).reshape(len(of), -1)
         return cls(image, turn, fisheye, lens, np.where(fisheye[:, None], 0.0, xy))
 
     def seen(self, cameras: Cameras, lens: Array) -> tuple[Array, Array, Array, NDArray[np.int64]]:
-        """The views' rotations [m, 3, 3], centres [m, 3], lenses [m, 11] and numbers [m].
+        """The views' rotations [m, 3, 3], centres [m, 3], lenses as the kernels take them and numbers [m].
 
         Args:
             lens: of the photos [n, 11].
         """
-        lenses = np.where(self.fisheye[:, None], self.lens, lens[self.of])
+        lenses = self.lens.copy()
+        lenses[~self.fisheye, :LENS_ROW] = lens[self.of[~self.fisheye]]
         rotation = cameras.rotation[self.of] @ self.cam_from_view
         return rotation, cameras.centre[self.of], lenses, np.arange(len(self.of))
 
@@ -74,12 +90,12 @@ def _away_and_around(forward: Array) -> Array:
     return np.stack([away, np.cross(forward, away), forward], 2)
 
 
-def _scales(cam_from_view: Array, image: NDArray[np.int64], intrinsics: Intrinsics) -> Array:
-    """Pixels per radian [m, 2] along both axes of views, straight ahead."""
+def _photo_by_slope(cam_from_view: Array, image: NDArray[np.int64], intrinsics: Intrinsics) -> Array:
+    """Derivatives [m, 2, 2] of where photos (px) show what is straight ahead in views, by the views' two slopes."""
 
     def shown(away: float, around: float) -> Array:
         rays = cam_from_view @ np.array([away, around, 1.0])
         return project(intrinsics, torch.from_numpy(image), torch.from_numpy(rays)).numpy()
 
     steps = shown(_STEP, 0) - shown(-_STEP, 0), shown(0, _STEP) - shown(0, -_STEP)
-    return np.stack([np.linalg.norm(step, axis=1) for step in steps], 1) / (2 * _STEP)
+    return np.stack(steps, 2) / (2 * _STEP)

@@ -16,6 +16,7 @@ from biresnerf.refinement.adjustment.kernels.tracks import (
     track_errors,
     track_system,
 )
+from biresnerf.refinement.adjustment.lens.fisheyes import with_corrections
 from biresnerf.refinement.adjustment.solver.in_parts import in_parts
 from biresnerf.refinement.adjustment.solver.term import Linearised
 from biresnerf.refinement.adjustment.tangent_views import TangentViews
@@ -56,13 +57,13 @@ class TrackTerm:
         self.lens = lens_rows(intrinsics, cameras)
         self._given_noise = noise_px
         self.noise_px = 1.0 if noise_px is None else noise_px
-        rays = directions_in_cam(intrinsics, torch.from_numpy(self.image), torch.from_numpy(self.xy)).numpy()
+        self._intrinsics = intrinsics
+        self._views: tuple[Cameras, TangentViews] | None = None
+        now = with_corrections(intrinsics, cameras.lens_of, cameras.lens)
+        rays = directions_in_cam(now, torch.from_numpy(self.image), torch.from_numpy(self.xy)).numpy()
         flat = ~intrinsics.fisheye.numpy()[self.image]
         rays[flat] = cameras.rays_of(self.image[flat], rays[flat] / rays[flat, 2:])
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        self._views: TangentViews | None = None
-        if intrinsics.some_fisheye:
-            self._views = TangentViews.looking_at(rays, self.xy, self.image, intrinsics, self.lens[:, 4])
         world = np.einsum("mij,mj->mi", cameras.rotation[self.image], rays)
         focal = np.sqrt(self.lens[:, 0] * self.lens[:, 1])[self.image]
         self.unknowns = triangulate(cameras.centre[self.image], world, focal, self.point, count)
@@ -162,7 +163,17 @@ class TrackTerm:
         taken = taken or slice(0, len(points))
         start = self.start[taken.start : taken.stop + 1]
         lens = cameras.lens_rows(self.lens)
-        if self._views is None:
+        if not self._intrinsics.some_fisheye:
             return cameras.rotation, cameras.centre, lens, points[taken], start, self.image, self.xy
-        rotation, centre, lens, view = self._views.seen(cameras, lens)
-        return rotation, centre, lens, points[taken], start, view, self._views.xy
+        views = self._tangent_views(cameras)
+        rotation, centre, lens, view = views.seen(cameras, lens)
+        return rotation, centre, lens, points[taken], start, view, views.xy
+
+    def _tangent_views(self, cameras: Cameras) -> TangentViews:
+        """Those of the lenses as they are now; the last ones are kept."""
+        kept = self._views
+        if kept is None or not kept[0].same_lenses(cameras):
+            near = self.lens[:, 4]
+            kept = cameras, TangentViews.looking_at(self.xy, self.image, self._intrinsics, near, cameras)
+            self._views = kept
+        return kept[1]

@@ -82,7 +82,6 @@ def given_focals(dataset: Dataset, option: RefineIntrinsics) -> Lenses:
 
 
 def _lenses(dataset: Dataset, deviation: Array) -> Lenses:
-    deviation[[camera.full().fisheye for camera in dataset.cameras]] = 0.0  # corrections are of pinholes
     of_image = np.array([frame.camera for frame in dataset.frames], np.int64)
     return Lenses(of_image, np.zeros_like(deviation), deviation)
 

@@ -31,8 +31,7 @@ def first_step(scene: Scene, recipe: Recipe) -> JointOptimiser:
     poses = frame.unit_from_world.apply_to_poses(world_from_cam)
     excluded = scene.excluded_from_training
     adjusted = scene.tracks is not None and adjusts_cameras(dataset, recipe.method)
-    fisheye = any(camera.full().fisheye for camera in dataset.cameras)
-    by_photos = "none" if adjusted and not fisheye else options.refine_intrinsics
+    by_photos = "none" if adjusted else options.refine_intrinsics
     lenses = lenses_of(dataset, images, by_photos, excluded, recipe.device, dollies=not bodies.tied)
     optimiser = JointOptimiser(images, frame, poses, recipe, excluded, pose_mobility(start), bodies, lenses)
     optimiser.camera_errors.doubt(start.guessed)
@@ -40,7 +39,7 @@ def first_step(scene: Scene, recipe: Recipe) -> JointOptimiser:
 
 
 def adjusts_cameras(dataset: Dataset, method: Method) -> bool:
-    """Whether all cameras are adjusted at the end, and perspective lenses with them where there are tracks.
+    """Whether all cameras are adjusted at the end, and lenses with them where there are tracks.
 
     Not by methods of others.
     """

@@ -47,6 +47,11 @@ def point_jacobian(rotation, lens, cam, q, jac):
 @njit(inline="always", **KERNEL)
 def lens_jacobian(lens, cam, kinds, q, camera):
     """Columns of camera [2, 6 + kinds] from the seventh on: derivative of the residual in the lens's unknowns."""
+    if lens.shape[1] > 11 and lens[cam, 11] > 0:  # a fisheye's view (`adjustment.tangent_views`)
+        for k in range(len(kinds)):
+            at = 12 + 2 * kinds[k]
+            camera[0, 6 + k], camera[1, 6 + k] = lens[cam, at], lens[cam, at + 1]
+        return
     x, y = q[0] / q[2], q[1] / q[2]
     at_x, at_y = bent(lens, cam, x, y)
     for k in range(len(kinds)):

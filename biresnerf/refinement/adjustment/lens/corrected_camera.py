@@ -12,6 +12,7 @@ from biresnerf.geometry.camera.camera_models import (
 )
 from biresnerf.geometry.camera.distortion import coefficients_of, distort
 from biresnerf.geometry.camera.pixel_rays import rays_of_pixels
+from biresnerf.refinement.adjustment.lens.fisheyes import corrected_fisheye
 from biresnerf.refinement.adjustment.lens.lenses import ASPECT, CENTRE, DISTORTION, FOCAL
 
 Array = NDArray[np.float64]
@@ -25,12 +26,15 @@ def corrected_camera(camera: Camera, correction: Array) -> Camera:
 
     The corrected lens shows a direction where the camera would show another one. For a focal length that is a lens of
     the same model, exactly; so it is for a camera without distortion. Otherwise the principal point and the
-    coefficients up to k2, p1 and p2 that the model has are fitted, over the whole image. Fisheyes have no correction.
+    coefficients up to k2, p1 and p2 that the model has are fitted, over the whole image. Of a fisheye the correction is
+    of its own parameters.
     """
     if not correction.any():
         return camera
     longer = float(np.exp(correction[FOCAL]))
     old = camera.full()
+    if old.fisheye:
+        return camera.with_lens(corrected_fisheye(old, correction))
     lens = old._replace(
         fx=old.fx * longer, fy=old.fy * longer, p1=old.p1 * longer, p2=old.p2 * longer,
         k1=old.k1 * longer**2, k2=old.k2 * longer**4, k3=old.k3 * longer**6,
