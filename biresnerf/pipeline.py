@@ -46,7 +46,7 @@ from biresnerf.refinement.start.first_step import first_step, stage_lengths
 from biresnerf.refinement.verdict.evaluate import Evaluation, evaluate
 from biresnerf.refinement.verdict.judgement import judge
 from biresnerf.refinement.verdict.pose_uncertainty import pose_uncertainty
-from biresnerf.refinement.verdict.run_report import run_report
+from biresnerf.refinement.verdict.run_report import Findings, run_report
 from biresnerf.refinement.verdict.so_far import poses_so_far
 from biresnerf.refinement.views.held_out_views import held_out_views
 from biresnerf.report import Report
@@ -137,15 +137,13 @@ def _refine(input: str | Path | Dataset, setup: _Setup, observer: Observer, star
             shown = pictures.write_before_after(evaluation.views, judgement.renders)
             evaluation = replace(evaluation, views=shown)
         known = pose_uncertainty(scene.dataset, optimiser, finish, judgement)
-        report = run_report(
-            scene, optimiser, run.record, repair.repaired, evaluation.scores, judgement, finish, known
-        )
+        found = Findings(evaluation.scores, judgement, finish, known)
+        report = run_report(scene, optimiser, run.record, repair.repaired, found)
         report = write_result(setup.folder, scene, optimiser, setup.monitor, evaluation, report)
     except Interrupted:
         so_far = poses_so_far(scene, optimiser, run) if judgement is None else None
-        report = run_report(
-            scene, optimiser, run.record, repair.repaired, evaluation.scores, judgement, so_far=so_far
-        )
+        found = Findings(evaluation.scores, judgement, so_far=so_far)
+        report = run_report(scene, optimiser, run.record, repair.repaired, found)
         write_result(setup.folder, scene, optimiser, setup.monitor, evaluation, report, so_far)
         raise
     remember_rates(setup.recipe.device.type, setup.recipe.threads, setup.monitor.forecast.measured(TELLING_S))

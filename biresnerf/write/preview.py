@@ -23,7 +23,7 @@ from biresnerf.refinement.lost.lost_cameras import LostCameraRepair
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.run_state import RunState
-from biresnerf.refinement.verdict.run_report import run_report
+from biresnerf.refinement.verdict.run_report import Findings, run_report
 from biresnerf.refinement.verdict.so_far import poses_so_far
 from biresnerf.refinement.views.evaluation import render_view
 from biresnerf.write.output_folder import REPORT, OutputFolder
@@ -41,7 +41,7 @@ def write_preview(
     Returns the files, relative to the output folder.
     """
     path, so_far = folder.preview, poses_so_far(scene, optimiser, run)
-    report = run_report(scene, optimiser, run.record, repair.repaired, [], None, so_far=so_far)
+    report = run_report(scene, optimiser, run.record, repair.repaired, Findings(so_far=so_far))
     world_from_cam, dataset = so_far.offered(scene)
     write_transforms(dataset, world_from_cam, path / TRANSFORMS)
     write_poses_json(described(dataset, world_from_cam, report), path / POSES)

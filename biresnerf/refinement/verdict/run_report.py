@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -36,29 +37,36 @@ from biresnerf.uncertainty import PoseUncertainty
 ONE_PLACE = 0.9  # of the matches, within 0.3 % of the photo's long side
 
 
-def run_report(
-    scene: Scene,
-    optimiser: JointOptimiser,
-    record: RunRecord,
-    repaired: Collection[int],
-    scores: list[ViewScore],
-    judgement: Judgement | None,
-    finish: Finish | None = None,
-    uncertainty: tuple[PoseUncertainty, ...] = (),
-    so_far: SoFar | None = None,
-) -> Report:
-    """The report of a run as it is now.
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """What was found about the poses by now.
 
-    Args:
-        repaired: images whose pose was replaced.
+    Attributes:
         scores: of held-out views, as far as they are scored.
         judgement: None where there is no verdict.
         finish: what came of the adjustment of all cameras; None as long as the run is not complete.
         uncertainty: of each image's returned pose, or nothing.
         so_far: what a run offers that has no verdict yet; the present poses if not given.
     """
+
+    scores: Sequence[ViewScore] = ()
+    judgement: Judgement | None = None
+    finish: Finish | None = None
+    uncertainty: tuple[PoseUncertainty, ...] = ()
+    so_far: SoFar | None = None
+
+
+def run_report(
+    scene: Scene,
+    optimiser: JointOptimiser,
+    record: RunRecord,
+    repaired: Collection[int],
+    found: Findings = Findings(),
+) -> Report:
+    """The report of a run as it is now; ``repaired`` are the images whose pose was replaced."""
     from biresnerf import __version__
 
+    finish, judgement, so_far = found.finish, found.judgement, found.so_far
     dataset, given = scene.dataset, finish.given if finish is not None else None
     refined = so_far.refined if so_far is not None else RefinedPoses.now(dataset, optimiser)
     return Report(
@@ -67,11 +75,9 @@ def run_report(
         options=optimiser.options,
         verdict=judgement.verdict if judgement is not None else None,
         verdict_so_far=so_far.verdict if so_far is not None else None,
-        images=_image_reports(
-            scene, optimiser, repaired, scores, judgement, refined.world_from_cam, uncertainty
-        ),
+        images=_image_reports(scene, optimiser, repaired, refined.world_from_cam, found),
         cameras=camera_reports(dataset, refined.lenses),
-        heldout=held_out_report(optimiser, scores) if scores else None,
+        heldout=held_out_report(optimiser, found.scores) if found.scores else None,
         start_trials=scene.start.trials,
         candidates=finish.candidates if finish is not None else (),
         input_accuracy=given and accuracy_report(given),
@@ -96,7 +102,7 @@ def run_report(
         + gpu_warnings(optimiser.device)
         + smaller_batches(optimiser)
         + budget_warnings(optimiser.options.time_budget_s, record.seconds)
-        + _unknown_warnings(dataset, uncertainty),
+        + _unknown_warnings(dataset, found.uncertainty),
     )
 
 
@@ -141,7 +147,7 @@ def focal_warnings(dataset: Dataset, lenses: IntrinsicsParameters) -> tuple[str,
     return tuple(found)
 
 
-def held_out_report(optimiser: JointOptimiser, scores: list[ViewScore]) -> HeldOut:
+def held_out_report(optimiser: JointOptimiser, scores: Sequence[ViewScore]) -> HeldOut:
     """Means over the held-out views, at their present poses."""
     matrices = optimiser.poses.matrices().detach()
     return HeldOut(
@@ -221,14 +227,12 @@ def _image_reports(
     scene: Scene,
     optimiser: JointOptimiser,
     repaired: Collection[int],
-    scores: list[ViewScore],
-    judgement: Judgement | None,
     refined: np.ndarray,
-    uncertainty: tuple[PoseUncertainty, ...],
+    found: Findings,
 ) -> tuple[ImageReport, ...]:
     exposures = optimiser.exposure.gains()
     turn, shift = motion(scene.dataset.world_from_cam, refined)
-    scored = {score.image: score for score in scores}
+    scored = {score.image: score for score in found.scores}
     return tuple(
         ImageReport(
             name=frame.name,
@@ -237,12 +241,12 @@ def _image_reports(
             fixed=bool(optimiser.bodies.fixed[i]),
             moved_deg=float(turn[i]),
             moved_units=float(shift[i]),
-            uncertainty=uncertainty[i] if uncertainty else None,
+            uncertainty=found.uncertainty[i] if found.uncertainty else None,
             repaired=i in repaired,
             exposure=None if exposures is None else tuple(exposures[i].tolist()),
             psnr=scored[i].psnr if i in scored else None,
             ssim=scored[i].ssim if i in scored else None,
-            **_judged(judgement, i),
+            **_judged(found.judgement, i),
         )
         for i, frame in enumerate(scene.dataset.frames)
     )

@@ -24,7 +24,7 @@ from biresnerf.refinement.scene.scene_frame import scene_frame
 from biresnerf.refinement.stages.checkpoint import load_checkpoint
 from biresnerf.refinement.verdict.evaluate import Evaluation
 from biresnerf.refinement.verdict.pose_uncertainty import LOST, pose_uncertainty
-from biresnerf.refinement.verdict.run_report import run_report
+from biresnerf.refinement.verdict.run_report import Findings, run_report
 from biresnerf.write.output_folder import OutputFolder
 from biresnerf.write.result import write_result
 from tests.refinement.tiny_scene import (
@@ -195,9 +195,8 @@ def test_the_report_names_those_that_stay_lost_and_those_repaired(scene, tmp_pat
     run.repair.repaired = [ORBITED]
     dataset = scene[0]
     known = pose_uncertainty(dataset, run.optimiser, Finish(), None)
-    partial = run_report(
-        run.scene, run.optimiser, run.state.record, run.repair.repaired, [], None, uncertainty=known
-    )
+    found = Findings(uncertainty=known)
+    partial = run_report(run.scene, run.optimiser, run.state.record, run.repair.repaired, found)
     report = write_result(OutputFolder(tmp_path), run.scene, run.optimiser, Monitor(), Evaluation(), partial)
     lost = [image.name for image in report.images if image.uncertainty.why_unknown == LOST]
     assert lost == [dataset.names[TURNED]]

@@ -48,7 +48,7 @@ def test_a_run_without_enough_memory_ends_with_smaller_batches_and_says_so(scene
     assert max(through) <= 400
     assert optimiser.batch_share < 1
     assert pose_error(optimiser.poses.poses().numpy(), scene[0].world_from_cam).aligned.rotation_deg.mean < 5
-    warnings = run_report(run.scene, optimiser, run.state.record, [], [], None).warnings
+    warnings = run_report(run.scene, optimiser, run.state.record, []).warnings
     assert any("GPU's memory is too small" in warning for warning in warnings)
 
 
