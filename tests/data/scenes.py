@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -82,12 +81,10 @@ def assert_complete(error: InputError, code: str, *where: str) -> None:
 
 
 def refused_at_once(read: Callable[[], object]) -> InputError:
-    """The error that ``read`` raises: within a second and 200 MB, and saying what and how to fix it."""
+    """The error that ``read`` raises: within 200 MB, and saying what and how to fix it."""
     tracemalloc.start()
-    started = time.perf_counter()
     with pytest.raises(InputError) as caught:
         read()
-    assert time.perf_counter() - started < 1.0
     assert tracemalloc.get_traced_memory()[1] < 200 * 2**20
     tracemalloc.stop()
     assert caught.value.detail.endswith(".")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
 from PIL import Image
@@ -69,14 +67,10 @@ def test_claims_that_no_camera_can_make_are_not_passed_on(tmp_path):
 
 
 def test_the_header_of_a_png_is_read_without_its_pixels(tmp_path):
-    path = tmp_path / "large.png"
-    Image.fromarray(np.zeros((4000, 4000, 3), dtype=np.uint8)).save(path, compress_level=1)
-    started = time.perf_counter()
-    assert read_header(path, "large").width == 4000
-    decoding = time.perf_counter()
-    with Image.open(path) as image:
-        image.load()
-    assert decoding - started < 0.2 * (time.perf_counter() - decoding)
+    path = tmp_path / "cut.png"
+    Image.fromarray(np.zeros((400, 400, 3), dtype=np.uint8)).save(path)
+    path.write_bytes(path.read_bytes()[:60])  # who wants pixels finds none
+    assert read_header(path, "cut").width == 400
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".webp", ".png"])
@@ -102,13 +96,16 @@ EXIF_PIECE = b"\xff\xe1\x00\x10Exif\0\0abcdefgh"
      b"\xff\xe5\x00\x04ab" * 500_000],
     ids=["exif", "fill", "exif behind fill", "other segments"],
 )  # fmt: skip
-def test_a_jpeg_whose_head_is_in_a_million_pieces_is_refused_by_its_name_at_once(tmp_path, start):
+def test_a_jpeg_whose_head_is_in_a_million_pieces_is_refused_by_its_name_at_once(
+    tmp_path, start, monkeypatch
+):
     path = jpeg_with(tmp_path / "a.jpg", start)
-    began = time.process_time()
+    opened = []
+    monkeypatch.setattr(Image, "open", lambda *_, **__: opened.append(path))
     with pytest.raises(InputError, match="pieces") as caught:
         read_header(path, "a.jpg")
     assert (caught.value.code, caught.value.where) == ("not_an_image", "a.jpg")
-    assert time.process_time() - began < 1
+    assert not opened, "before Pillow looks at each piece"
 
 
 def test_a_jpeg_with_a_long_profile_and_a_depth_map_in_its_head_is_read(tmp_path):
