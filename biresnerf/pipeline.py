@@ -16,7 +16,8 @@ from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.given_poses.likely_reading import as_warning, pose_question
 from biresnerf.data.given_poses.readings import read_as
 from biresnerf.data.model.dataset import Dataset
-from biresnerf.data.model.part_of_set import without_copies, without_photos
+from biresnerf.data.model.part_of_set import without_photos
+from biresnerf.data.photos.alike.copied_photos import without_copies
 from biresnerf.data.photos.guessed_lens import with_shared_predictions
 from biresnerf.data.photos.images import load_images
 from biresnerf.data.photos.panoramas.cut_panoramas import called_panoramas, cut_panoramas

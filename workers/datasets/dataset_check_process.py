@@ -68,9 +68,9 @@ def check(
     """
     from biresnerf.data.formats.read_dataset import read_dataset
     from biresnerf.data.given_poses.likely_reading import pose_question
-    from biresnerf.data.model.part_of_set import without_copies
+    from biresnerf.data.photos.alike.copied_photos import without_copies
+    from biresnerf.data.photos.alike.turning_object import turning_notes
     from biresnerf.data.photos.images import load_images
-    from biresnerf.data.photos.turning_object import turning_notes
     from workers.datasets.shown_set import expected_seconds, small_side, write_shown
 
     sent = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}

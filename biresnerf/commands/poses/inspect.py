@@ -40,10 +40,11 @@ def inspect_command(
     asked = parse_options({**settings, **({"preset": preset} if preset else {})})
     from biresnerf.data.formats.read_dataset import read_dataset
     from biresnerf.data.given_poses.readings import read_as
-    from biresnerf.data.model.part_of_set import without_copies, without_photos
+    from biresnerf.data.model.part_of_set import without_photos
+    from biresnerf.data.photos.alike.copied_photos import without_copies
+    from biresnerf.data.photos.alike.turning_object import turning_notes
     from biresnerf.data.photos.images import load_images
     from biresnerf.data.photos.panoramas.cut_panoramas import called_panoramas
-    from biresnerf.data.photos.turning_object import turning_notes
     from biresnerf.data.photos.video.video_frames import VideoReading
 
     dataset = read_dataset(input_path, videos=VideoReading(asked.video_frames))

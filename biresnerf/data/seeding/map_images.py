@@ -15,9 +15,9 @@ from PIL import Image
 
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.image_order import natural_order, pose_distances
+from biresnerf.data.photos.alike.image_likeness import likeness
 from biresnerf.data.photos.decode import decode
 from biresnerf.data.photos.image_files import is_plain, quiet_pillow
-from biresnerf.data.photos.image_likeness import likeness
 from biresnerf.data.photos.images import decoding_threads
 from biresnerf.data.photos.masks import write_masks
 from biresnerf.data.points.tracks import KEPT, keep_tracks

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from biresnerf.data.formats.positions.position_priors import position_priors
 from biresnerf.data.model.dataset import GUESSES, Cut, Dataset
-from biresnerf.data.photos.image_likeness import likeness
+from biresnerf.data.photos.alike.image_likeness import likeness
+from biresnerf.data.photos.alike.turning_object import turning_notes
 from biresnerf.data.photos.named_images import MIN_IMAGES
 from biresnerf.data.photos.orientation import shown_from_cam
 from biresnerf.data.photos.photo_folders import few_names
-from biresnerf.data.photos.turning_object import turning_notes
 from biresnerf.data.seeding.cached_mapping import remembered_mapping
 from biresnerf.data.seeding.initial_poses import InitialPoses, even_ring
 from biresnerf.data.seeding.map_images import (

@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from biresnerf.data.photos.alike.turning_object import IN_THE_WAY, still_surroundings
 from biresnerf.data.photos.images import ImageSet
-from biresnerf.data.photos.turning_object import IN_THE_WAY, still_surroundings
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.errors import InputError, Interrupted
 from biresnerf.geometry.level_ring import order_on_ring

@@ -6,7 +6,7 @@ import tracemalloc
 
 import numpy as np
 
-from biresnerf.data.photos.turning_object import goes_round, still_surroundings
+from biresnerf.data.photos.alike.turning_object import goes_round, still_surroundings
 
 
 def turning(count: int, turns: float = 1.0, seed: int = 0) -> np.ndarray:

@@ -8,7 +8,7 @@ from PIL import Image
 
 from biresnerf.data.model.dataset import Dataset, Frame, SourceFormat
 from biresnerf.data.model.image_order import natural_order, taken_along_a_path
-from biresnerf.data.photos.image_likeness import likeness
+from biresnerf.data.photos.alike.image_likeness import likeness
 from biresnerf.data.seeding.missing_poses import guess_missing
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.pose_error import rotation_between_deg

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from biresnerf.data.formats.read_dataset import read_dataset
-from biresnerf.data.model.part_of_set import without_copies
+from biresnerf.data.photos.alike.copied_photos import without_copies
 from biresnerf.data.seeding.seed_poses import seed_poses
 from biresnerf.geometry.pose_error import rotation_between_deg
 from tests.data.test_real_sets import ROOT

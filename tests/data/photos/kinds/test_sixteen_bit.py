@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from biresnerf.data.formats.read_dataset import read_dataset
-from biresnerf.data.photos.image_likeness import thumbnails
+from biresnerf.data.photos.alike.image_likeness import thumbnails
 from biresnerf.data.photos.images import load_images
 from biresnerf.data.seeding.map_images import lay_out
 from tests.data.scenes import HEIGHT, WIDTH, nerfstudio_scene, save

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.image_order import natural_order
-from biresnerf.data.photos.image_likeness import thumbnails
+from biresnerf.data.photos.alike.image_likeness import thumbnails
 
 TURNING = (
     "In the order of their names, the photos seem to go once around an object, as on a turntable: if features do not "

@@ -1,0 +1,1 @@
+"""How alike whole photos are: which show the same, which are copies, and whether an object turned."""
