@@ -41,6 +41,7 @@ SECTIONS = (
             "refine": "biresnerf.commands.poses.refine:refine_command",
             "inspect": "biresnerf.commands.poses.inspect:inspect_command",
             "evaluate": "biresnerf.commands.poses.evaluate:evaluate_command",
+            "compare-results": "biresnerf.commands.poses.compare_results:compare_results_command",
             "convert": "biresnerf.commands.poses.convert:convert_command",
             "export": "biresnerf.commands.poses.export:export_command",
             "view": "biresnerf.commands.poses.view:view_command",

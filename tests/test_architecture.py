@@ -141,6 +141,7 @@ def test_every_contract_has_a_violation_that_breaks_it():
         ("biresnerf.command_line", HEAVY),
         ("biresnerf.wire.jobs", (*HEAVY, "httpx", "workers", "service")),
         ("biresnerf.client", (*HEAVY, "pydantic_settings", "workers", "service")),
+        ("biresnerf.comparison.compare_results", ("torch", "numba", "pycolmap")),
         ("workers.jobs.jobs", ("torch", "numba", "pycolmap")),
         ("workers.queue.slot", ("torch", "numba", "pycolmap")),
         ("workers.datasets.shown_set", ("torch", "numba", "pycolmap")),

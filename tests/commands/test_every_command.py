@@ -76,7 +76,7 @@ def test_a_command_answers_in_json_and_says_what_each_option_is_for(name: str) -
 @pytest.mark.parametrize(
     "command",
     ["inspect nowhere", "refine nowhere -o out", "evaluate nowhere truth", "convert nowhere out --to kitti",
-     "export nowhere kitti", "view nowhere", "report nowhere", "compare nowhere -o out"],
+     "export nowhere kitti", "view nowhere", "report nowhere", "compare nowhere -o out", "compare-results nowhere out"],
 )  # fmt: skip
 def test_a_wrong_path_is_answered_before_torch_is_loaded(tmp_path, command: str) -> None:
     code = (

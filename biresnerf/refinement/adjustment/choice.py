@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.comparison.paired import student_quantile
 from biresnerf.refinement.adjustment.lens.lenses import Lenses
-from biresnerf.refinement.adjustment.paired import student_quantile
 from biresnerf.report import CandidateName, CandidateReport
 
 logger = logging.getLogger(__name__)

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.comparison.paired import EPIPOLAR_MATTERS, paired
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.points.tracks import Tracks
-from biresnerf.refinement.adjustment.paired import paired
 from biresnerf.refinement.lost.own_matches import LEAST_PX, OwnMatches, well_matched
-from biresnerf.refinement.verdict.verdict import EPIPOLAR_MATTERS
 from biresnerf.refinement.views.compare_rigs import Rig
 from biresnerf.report import EpipolarEvidence
 

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from biresnerf.comparison.paired import EPIPOLAR_MATTERS
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.refinement.finish.expected_errors import expected_errors
 from biresnerf.refinement.finish.gather_evidence import without_patches
@@ -17,7 +18,7 @@ from biresnerf.refinement.stages.checkpoint import BestSoFar
 from biresnerf.refinement.stages.run_state import RunState
 from biresnerf.refinement.start.refined_poses import RefinedPoses
 from biresnerf.refinement.verdict.judgement import compare_without_training
-from biresnerf.refinement.verdict.verdict import EPIPOLAR_MATTERS, decide, matches_are_better
+from biresnerf.refinement.verdict.verdict import decide, matches_are_better
 from biresnerf.report import Verdict
 
 UNMEASURED = (

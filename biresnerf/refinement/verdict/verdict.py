@@ -12,15 +12,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.comparison.paired import FITS_BELOW
 from biresnerf.refinement.views.compare_rigs import photos_tell
 from biresnerf.report import EpipolarEvidence, HeldOutEvidence, PairedDifference, Verdict, VerdictName
 
 Array = NDArray[np.float64]
 
-EPIPOLAR_MATTERS = 0.1  # log2, a difference that matters: 7 % of the error
 MEASURABLE_PX = 0.1  # at working size: less motion cannot be seen in photos of that size
-# Feature matches that miss by more than this share of the image fit no scene: neither set of poses can be trusted.
-FITS_BELOW = 0.02
 # Matches speak for poses only if the error that they lose is so large a share of the motion, but for one px of it:
 # poses that fitted well need not move far to fit a little better (docs/verdict.md).
 EXPLAINED, UNEXPLAINED_PX = 0.1, 1.0

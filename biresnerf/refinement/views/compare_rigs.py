@@ -9,10 +9,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.comparison.paired import PSNR_MATTERS, SSIM_MATTERS, paired
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.workload import LOOKS, picture_share
 from biresnerf.geometry.camera.camera_models import Camera
-from biresnerf.refinement.adjustment.paired import paired
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.scene.scene import Scene
@@ -26,7 +26,6 @@ BeforeAfter = dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]]
 
 SHOWN = 4  # held-out views that are rendered with either rig, to be looked at
 # Differences that matter and are larger than chance: trainings on the same poses differ by less (docs/verdict.md).
-PSNR_MATTERS, SSIM_MATTERS = 0.5, 0.01  # dB, and 1
 # Poses that photos miss by less than half of a motion are nearer to the truth than those before it: the triangle's
 # inequality. Short trainings blur, and so miss by up to so much at true poses (px at working size, docs/verdict.md).
 NEARER, BLUR_PX = 0.5, 2.0

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 
+from biresnerf.comparison.paired import EPIPOLAR_MATTERS
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import pose_error
 from biresnerf.refinement.stages.checkpoint import load_checkpoint
 from biresnerf.refinement.verdict import judgement
 from biresnerf.refinement.verdict.so_far import UNMEASURED, SoFar, poses_so_far
-from biresnerf.refinement.verdict.verdict import EPIPOLAR_MATTERS
 from tests.refinement.tiny_scene import TinyRun, given_scene, tiny_optimiser, tiny_options, tiny_set
 from tests.refinement.verdict.test_judgement import VIEWS, true_matches, with_poses
 

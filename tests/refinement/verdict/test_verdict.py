@@ -8,17 +8,21 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from biresnerf.refinement.adjustment.paired import paired, student_quantile
-from biresnerf.refinement.verdict.verdict import (
+from biresnerf.comparison.paired import (
     EPIPOLAR_MATTERS,
     FITS_BELOW,
+    PSNR_MATTERS,
+    SSIM_MATTERS,
+    paired,
+    student_quantile,
+)
+from biresnerf.refinement.verdict.verdict import (
     MEASURABLE_PX,
     Findings,
     decide,
     failed_checks,
     frame_doubt,
 )
-from biresnerf.refinement.views.compare_rigs import PSNR_MATTERS, SSIM_MATTERS
 from biresnerf.report import EpipolarEvidence, HeldOutEvidence
 
 OPPOSITE = {"better": "worse", "worse": "better", "same": "same", "open": "open"}

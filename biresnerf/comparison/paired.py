@@ -14,6 +14,10 @@ STUDENT = (
     12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228, 2.201, 2.179, 2.160, 2.145, 2.131,
     2.120, 2.110, 2.101, 2.093, 2.086, 2.080, 2.074, 2.069, 2.064, 2.060, 2.056, 2.052, 2.048, 2.045, 2.042,
 )  # fmt: skip
+# Differences that matter: of unseen views in dB and in SSIM, of matching errors in log2 (7 % of the error).
+PSNR_MATTERS, SSIM_MATTERS, EPIPOLAR_MATTERS = 0.5, 0.01, 0.1
+# Feature matches that miss by more than this share of the image fit no scene: neither set of poses can be trusted.
+FITS_BELOW = 0.02
 SAME_WITHIN = 1.5  # times what matters: an interval inside it means no difference
 
 
