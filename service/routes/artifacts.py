@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 from urllib.parse import quote
 
 from fastapi import APIRouter
 from fastapi.responses import Response, StreamingResponse
 
+from biresnerf.comparison.compare_results import compare_results
+from biresnerf.comparison.conclusion import Comparison
+from biresnerf.data.formats.simple.poses_json import POSES, PosesDocument
 from biresnerf.report import Report
 from biresnerf.wire.jobs import job_url
 from biresnerf.wire.results import ArtifactList, ArtifactView
@@ -59,6 +63,35 @@ async def get_report(job_id: JobId, caller: ReadCaller) -> Response:
     artifact = await find_report(caller, job_id)
     content = await whole_file(caller, artifact)
     return Response(content, media_type="application/json", headers={"ETag": f'"{artifact.sha256}"'})
+
+
+@router.get("/comparison/{other_id}", responses=declared("expired", "result_not_ready", "state_conflict"))
+async def compare_jobs(job_id: JobId, other_id: JobId, caller: ReadCaller) -> Comparison:
+    """Which of two results is better, this job's (`first`) or the other one's (`second`), and by what.
+
+    It is said of the poses that were returned, from both jobs' `report.json` and `poses.json`.
+    """
+    first, second = [await _result_files(caller, each) for each in (job_id, other_id)]
+    # Large files take a moment to read.
+    return await asyncio.to_thread(_compared, first, second)
+
+
+async def _result_files(caller: Caller, job_id: str) -> tuple[bytes, bytes]:
+    report = await find_report(caller, job_id)
+    poses = await find_artifact(caller.jobs, job_id, POSES)
+    return await whole_file(caller, report), await whole_file(caller, poses)
+
+
+def _compared(first: tuple[bytes, bytes], second: tuple[bytes, bytes]) -> Comparison:
+    try:
+        results = [
+            (Report.model_validate_json(report), PosesDocument.model_validate_json(poses))
+            for report, poses in (first, second)
+        ]
+    except ValueError:
+        detail = "A result was written by another version, or holds no poses: it cannot be compared."
+        raise ProblemError("state_conflict", detail) from None
+    return compare_results(*results)
 
 
 async def find_report(caller: Caller, job_id: str) -> Artifact:

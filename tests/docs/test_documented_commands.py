@@ -33,7 +33,7 @@ NOT_RUN = {
     "python -m pytest": "CI runs all tests",
     "python deploy/slurm": "needs Slurm; tests/deploy/test_slurm.py runs it on one",
     "python -m benchmarks": "takes minutes to hours; the figures stand beside the command",
-    "biresnerf compare": "takes hours; tests/studies/commands/test_compare.py runs a small one",
+    "biresnerf compare ": "takes hours; tests/studies/commands/test_compare.py runs a small one",
     "biresnerf study": "takes hours; tests/studies/commands/test_compare.py runs a small one",
     "biresnerf up": "the service that all other commands here ask is it, on a free port",
     "biresnerf submit photos --deliver": "needs a bucket; tests/service/client/test_addresses.py has one",

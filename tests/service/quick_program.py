@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 import signal
 import sys
@@ -17,6 +18,7 @@ from biresnerf.options.refine_options import parse_options
 from biresnerf.progress import Progress
 from biresnerf.report import Report
 from service.docs.examples import example_of
+from service.web_page import EXAMPLE
 
 folder = Path(sys.argv[1])
 order = json.loads((folder / "job.json").read_text())
@@ -71,7 +73,15 @@ shutil.copy(poses, output / "transforms.json")
 (output / "colmap" / "sparse" / "0").mkdir(parents=True)
 for table in ("cameras", "images", "points3D"):
     (output / "colmap" / "sparse" / "0" / f"{table}.bin").write_bytes(bytes(8))
-(output / "poses.json").write_text("{}")
+# Three photos of a real result; `seed` turns them apart, by as many degrees times their number.
+document = json.loads((EXAMPLE / "poses.json").read_text())
+document["images"] = [{**pose, "name": name} for pose, name in zip(document["images"], "abc", strict=False)]
+for number, pose in enumerate(document["images"]):
+    turn = math.radians(number * options["seed"])
+    for row in pose["world_from_cam"]:
+        x, y = row[:2]
+        row[:2] = (x * math.cos(turn) + y * math.sin(turn), y * math.cos(turn) - x * math.sin(turn))
+(output / "poses.json").write_text(json.dumps(document))
 (output / "renders").mkdir()
 (output / "renders" / "orbit.mp4").write_bytes(bytes(range(256)) * 40)
 (output / "renders" / "Blick über «Dach».png").write_bytes(b"\x89PNG")

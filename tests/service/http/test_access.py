@@ -97,6 +97,7 @@ def address(path: str, owner: Tenant) -> str:
         **{"path": "transforms.json", "name": "report.json", "photo": "0"},
         **{"webhook_id": owner.webhook, "delivery_id": owner.delivery, "link_id": owner.link},
         "batch_id": owner.batch,
+        "other_id": owner.job,
     }
     return re.sub(r"\{(\w+)(:\w+)?\}", lambda match: values[match[1]], path)
 
