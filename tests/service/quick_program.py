@@ -1,6 +1,7 @@
 """A job program for the tests: the protocol of `workers.run.job_process`, real result files, no torch.
 
 `steps` says how many steps, `seed` how many milliseconds each takes; `threads=77` fails as a diverged job does.
+Matches contradict all photos where `seed` is above 30.
 """
 
 from __future__ import annotations
@@ -93,7 +94,8 @@ verdict = {
     "moved_px": 1,
 }
 example = example_of(Report)
-image = example["images"][0]
+known = {"known_from": "matches", "rotation_deg": 0.08}
+image = {**example["images"][0], "uncertainty": known, "contradicted": options["seed"] > 30}
 images = [
     {**image, "name": name, "moved_deg": moved, "trial_psnr_before": before, "trial_psnr_after": after}
     for name, moved, before, after in (("a", 1.0, None, None), ("b", 3.0, 20.0, 21.0), ("c", 2.0, 20.0, 24.0))
