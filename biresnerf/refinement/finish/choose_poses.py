@@ -17,6 +17,7 @@ from biresnerf.refinement.adjustment.adjustment import NOTHING_FITS, Adjustment,
 from biresnerf.refinement.adjustment.cameras import Cameras
 from biresnerf.refinement.adjustment.choice import Candidate, Choice, choose
 from biresnerf.refinement.adjustment.evidence import Evidence, NoiseLevels, PosePrior
+from biresnerf.refinement.adjustment.lens.lenses import FOCAL, K1, LENS
 from biresnerf.refinement.adjustment.measured_terms import control_believed, measured_misfits
 from biresnerf.refinement.adjustment.solver.covariance import NOTHING_KNOWN
 from biresnerf.refinement.finish.candidates import (
@@ -42,6 +43,11 @@ logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
+OF_MATCHES: tuple[CandidateName, ...] = (
+    "input",
+    "matched",
+)  # as COLMAP left them: the input's, of photos alone
+SAME_POSES = 1e-6
 # Of tracks, in px or in shares of the photos' size. Sets have 0.1 to 0.5 px.
 MOST_NOISE_PX, MOST_NOISE = 2.0, 0.002
 # Poses nearer than this to those that tracks prefer, in standard deviations of a camera's pose, may be the true ones.
@@ -88,6 +94,9 @@ def choose_poses(
     for kind, (misfit_to, as_well) in measured_misfits(rigs).items():
         misfits[kind], alike[kind] = misfit_to, as_well
     choice = _choice(candidates, misfits, alike, scene.start)
+    if choice.chosen.name in OF_MATCHES and by_tracks is not None and "tracks" in misfits:
+        misfits["tracks"] = _as_if_left_out(candidates, misfits["tracks"], split, prior, noise)
+        choice = _choice(candidates, misfits, alike, scene.start)
     announce()
     chosen, evidence = choice.chosen, dict.fromkeys(results, split.fitted)
     if chosen.name in BY_TRACKS:  # nothing has to be judged any more
@@ -193,6 +202,39 @@ def _within(
 def _misfit(candidate: Candidate, evidence: Evidence, noise: NoiseLevels) -> Array:
     """Of its own poses and lenses."""
     return misfit(candidate.world_from_cam, replace(evidence, lenses=candidate.lenses), noise)
+
+
+def _as_if_left_out(
+    candidates: Sequence[Candidate],
+    misfits: Array,
+    split: SplitEvidence,
+    prior: PosePrior,
+    noise: NoiseLevels,
+) -> Array:
+    """Misfits [candidates, m] to tracks, where poses of matches know nothing of the tracks that judge.
+
+    COLMAP fitted its model to all tracks, so those left out speak for it. In its place stands what its poses and its
+    simple lens become by the others alone, where that fits worse.
+    """
+    matched = next((each for each in candidates if each.name == "matched"), None)
+    if matched is None:
+        return misfits
+    lenses = split.fitted.lenses
+    simple = None if lenses is None else lenses.held(~np.isin(np.arange(LENS), (FOCAL, K1)))
+    evidence = replace(split.fitted, patches=None, lenses=simple)
+    around = replace(prior, world_from_cam=matched.world_from_cam)
+    found = adjust_poses(matched.world_from_cam, evidence, around)
+    known = None if found.lenses is None or simple is None else simple.known(found.lenses.correction)
+    again = _misfit(
+        replace(matched, world_from_cam=found.world_from_cam, lenses=known), split.left_out, noise
+    )
+    judged = again[~prior.fixed & split.placed]
+    judging = misfits.copy()
+    for row, each in enumerate(candidates):
+        alike = np.allclose(each.world_from_cam, matched.world_from_cam, rtol=0, atol=SAME_POSES)
+        if each.name in OF_MATCHES and alike and np.nanmedian(judged) > np.nanmedian(misfits[row]):
+            judging[row] = judged
+    return judging
 
 
 def _tells(misfits: Array) -> bool:

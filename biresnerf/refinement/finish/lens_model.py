@@ -23,8 +23,7 @@ logger = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 MOST_OBSERVATIONS = 20_000  # more tell the same
-# Standard deviations, and errors that tracks share, by which a parameter must differ from a simpler lens's.
-CLEAR = 2.0
+CLEAR = 2.0  # standard errors by which tracks that were left out must fit better
 
 
 def supported_lenses(
@@ -89,7 +88,7 @@ def _told(best: Adjustment, fitted: Evidence, prior: PosePrior, kept: Lenses) ->
     deviation = posterior(linear.system, POSE * len(cameras), lenses)
     with np.errstate(invalid="ignore"):
         known = lenses.free & ~kept.free & (deviation < OBSERVABLE * lenses.deviation)
-        return np.asarray((known & (moved > CLEAR * TRACK_MODEL_ERROR * deviation)).any(1))
+        return np.asarray((known & (moved > TRACK_MODEL_ERROR * deviation)).any(1))
 
 
 def _pays(found: Adjustment, best: Adjustment, left_out: Evidence) -> bool:

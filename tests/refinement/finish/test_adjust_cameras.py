@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 import torch
 
+from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.data.workload import photo_check
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.geometry.rigid_bodies import RigidBodies
+from biresnerf.refinement.adjustment.adjustment import adjust_poses
+from biresnerf.refinement.adjustment.evidence import Evidence, PosePrior
 from biresnerf.refinement.adjustment.lens.corrected_camera import corrected_camera
 from biresnerf.refinement.finish import adjust_cameras as module
 from biresnerf.refinement.finish import choose_poses, photo_trial
@@ -309,3 +312,17 @@ def test_guessed_poses_have_no_accuracy(tmp_path, rng):
     guessed = tuple(replace(frame, pose_source="neighbours") for frame in run.scene.dataset.frames)
     run.scene = replace(run.scene, dataset=replace(run.scene.dataset, frames=guessed))
     assert adjusted(run).given is None
+
+
+def test_poses_of_matches_are_judged_without_the_tracks_that_judge(tmp_path, rng):
+    """Photos alone: the mapper fitted its poses to all of few tracks."""
+    run, truth = begun(tmp_path, rng, points=100, source="colmap", given=wild(rng))
+    dataset = run.scene.dataset
+    evidence = Evidence(lenses(dataset), run.scene.tracks)
+    mapped = adjust_poses(truth, evidence, PosePrior.equal(truth, 0.1, 0.4)).world_from_cam
+    frames = tuple(replace(f, world_from_cam=pose) for f, pose in zip(dataset.frames, mapped, strict=True))
+    source = "matches-incremental"
+    start = InitialPoses(mapped, source, (source,) * VIEWS, (), mapped)
+    run.scene = replace(run.scene, dataset=replace(dataset, frames=frames), start=start)
+    misfits = {each.name: each.track_misfit for each in adjusted(run).candidates}
+    assert misfits["input"] == misfits["matched"] == pytest.approx(misfits["adjusted-tracks"], rel=0.03)
