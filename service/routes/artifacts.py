@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import asyncio
 from urllib.parse import quote
 
 from fastapi import APIRouter
 from fastapi.responses import Response, StreamingResponse
 
-from biresnerf.comparison.compare_results import compare_results
 from biresnerf.comparison.conclusion import Comparison
-from biresnerf.data.formats.simple.poses_json import POSES, PosesDocument
 from biresnerf.report import Report
 from biresnerf.wire.jobs import job_url
 from biresnerf.wire.results import ArtifactList, ArtifactView
 from service.http.access import Caller, ReadCaller
 from service.http.dependencies import JobId
 from service.http.problems import ProblemError, declared
+from service.intake.result_comparison import ResultFiles, compared
 from service.responses.downloads import (
     DOWNLOAD_RESPONSES,
     DownloadConditions,
@@ -26,7 +24,7 @@ from service.responses.downloads import (
 from workers.records import Artifact
 
 router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["results"])
-REPORT = "report.json"
+REPORT, POSES = "report.json", "poses.json"
 
 
 @router.get("/artifacts", responses=declared("expired"))
@@ -72,26 +70,14 @@ async def compare_jobs(job_id: JobId, other_id: JobId, caller: ReadCaller) -> Co
     It is said of the poses that were returned, from both jobs' `report.json` and `poses.json`.
     """
     first, second = [await _result_files(caller, each) for each in (job_id, other_id)]
-    # Large files take a moment to read.
-    return await asyncio.to_thread(_compared, first, second)
+    return await compared(caller, first, second)
 
 
-async def _result_files(caller: Caller, job_id: str) -> tuple[bytes, bytes]:
+async def _result_files(caller: Caller, job_id: str) -> ResultFiles:
     report = await find_report(caller, job_id)
     poses = await find_artifact(caller.jobs, job_id, POSES)
-    return await whole_file(caller, report), await whole_file(caller, poses)
-
-
-def _compared(first: tuple[bytes, bytes], second: tuple[bytes, bytes]) -> Comparison:
-    try:
-        results = [
-            (Report.model_validate_json(report), PosesDocument.model_validate_json(poses))
-            for report, poses in (first, second)
-        ]
-    except ValueError:
-        detail = "A result was written by another version, or holds no poses: it cannot be compared."
-        raise ProblemError("state_conflict", detail) from None
-    return compare_results(*results)
+    texts = [(await whole_file(caller, each)).decode() for each in (report, poses)]
+    return ResultFiles(report=texts[0], poses=texts[1])
 
 
 async def find_report(caller: Caller, job_id: str) -> Artifact:

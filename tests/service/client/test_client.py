@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import json
 import socket
 import threading
 from collections.abc import Callable, Iterator
@@ -90,7 +91,7 @@ def test_a_folder_becomes_a_job_and_its_result_a_folder(
     assert [line.n for line in client.log(job.id)] == [1, 2]
     assert [line.text for line in client.log(job.id, after=1)] == ["line 2"]
     link = client.share(job.id, "poses.json", valid_s=60)
-    assert httpx.get(link.href).content == b"{}"
+    assert httpx.get(link.href).content == (tmp_path / "out/poses.json").read_bytes()
     export = client.wait(client.export(job.id, ["kitti"]).id)
     assert [one.id for one in client.exports(job.id)] == [export.id]
     assert client.export(job.id, ["kitti"]).id == export.id
@@ -288,6 +289,6 @@ def test_files_in_the_way_are_kept_and_names_choose(
             "report.json"
         ]
         client.download_all(done_job["id"], tmp_path, names=["poses.json"], replace=True)
-        assert (tmp_path / "poses.json").read_text() == "{}"
+        assert json.loads((tmp_path / "poses.json").read_text())["format"] == "biresnerf-poses"
         with pytest.raises(InputError, match="no file of the result"):
             client.download_all(done_job["id"], tmp_path, names=["nothing.txt"])
