@@ -40,6 +40,7 @@ NOT_RUN = {
     "biresnerf submit s3://": "needs a bucket; tests/service/client/test_addresses.py has one",
     "biresnerf restore": "wants an empty installation; tests/workers/upkeep/test_backup.py restores one",
     "biresnerf refine fern_without_poses": "photos from nearly one place, as tests/refinement/start has some",
+    "biresnerf export OUT kitti --poses-of body": "needs a flange's poses: tests/workers/jobs/test_derived_jobs.py",
     "ns-train ": "nerfstudio is not installed",
     "import json, smtplib\n": "serves until it is stopped; test_mail_receiver.py sends it events",
     "cp OUT/points.ply ": "after so few steps nothing in the field is solid, so there are no points",
