@@ -17,7 +17,6 @@ from biresnerf.refinement.adjustment.adjustment import NOTHING_FITS, Adjustment,
 from biresnerf.refinement.adjustment.cameras import Cameras
 from biresnerf.refinement.adjustment.choice import Candidate, Choice, choose
 from biresnerf.refinement.adjustment.evidence import Evidence, NoiseLevels, PosePrior
-from biresnerf.refinement.adjustment.lens.lenses import FOCAL, K1, LENS
 from biresnerf.refinement.adjustment.measured_terms import control_believed, measured_misfits
 from biresnerf.refinement.adjustment.solver.covariance import NOTHING_KNOWN
 from biresnerf.refinement.finish.candidates import (
@@ -32,7 +31,7 @@ from biresnerf.refinement.finish.expected_errors import expected_errors
 from biresnerf.refinement.finish.gather_evidence import SplitEvidence, gather_evidence
 from biresnerf.refinement.finish.given_poses import input_accuracy
 from biresnerf.refinement.finish.lens_evidence import contradicted_focals, focal_certainty, given_focals
-from biresnerf.refinement.finish.lens_model import supported_lenses
+from biresnerf.refinement.finish.lens_model import simple_lenses, supported_lenses
 from biresnerf.refinement.finish.outcome import Finish, fit_of, heeded, most_heeded
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.parameters.intrinsics_parameters import FocalCertainty
@@ -95,7 +94,7 @@ def choose_poses(
         misfits[kind], alike[kind] = misfit_to, as_well
     choice = _choice(candidates, misfits, alike, scene.start)
     if choice.chosen.name in OF_MATCHES and by_tracks is not None and "tracks" in misfits:
-        misfits["tracks"] = _as_if_left_out(candidates, misfits["tracks"], split, prior, noise)
+        misfits["tracks"] = _as_if_left_out(candidates, misfits["tracks"], split, prior, noise, cameras)
         choice = _choice(candidates, misfits, alike, scene.start)
     announce()
     chosen, evidence = choice.chosen, dict.fromkeys(results, split.fitted)
@@ -210,6 +209,7 @@ def _as_if_left_out(
     split: SplitEvidence,
     prior: PosePrior,
     noise: NoiseLevels,
+    cameras: Sequence[Camera],
 ) -> Array:
     """Misfits [candidates, m] to tracks, where poses of matches know nothing of the tracks that judge.
 
@@ -220,7 +220,7 @@ def _as_if_left_out(
     if matched is None:
         return misfits
     lenses = split.fitted.lenses
-    simple = None if lenses is None else lenses.held(~np.isin(np.arange(LENS), (FOCAL, K1)))
+    simple = None if lenses is None else simple_lenses(lenses, cameras)
     evidence = replace(split.fitted, patches=None, lenses=simple)
     around = replace(prior, world_from_cam=matched.world_from_cam)
     found = adjust_poses(matched.world_from_cam, evidence, around)

@@ -44,10 +44,8 @@ def supported_lenses(
     lenses = fitted.lenses
     if lenses is None:
         return None
-    simple = np.zeros_like(lenses.free)
-    simple[:, FOCAL], simple[:, K1] = True, ["k1" in REFINED_PARAMETERS[camera.model] for camera in cameras]
-    kept = lenses.held(~simple)
-    if not (lenses.free & ~simple).any():
+    kept = simple_lenses(lenses, cameras)
+    if (kept.free == lenses.free).all():
         return lenses
     if fitted.tracks is None or left_out.tracks is None:
         return kept
@@ -66,6 +64,13 @@ def supported_lenses(
             logger.info("lenses: parameters %s are free in %d of them", kind, told.sum())
             kept, best = tried, found
     return kept
+
+
+def simple_lenses(lenses: Lenses, cameras: Sequence[Camera]) -> Lenses:
+    """The lenses with no more free than a focal length, and the first radial coefficient where models have it."""
+    simple = np.zeros_like(lenses.free)
+    simple[:, FOCAL], simple[:, K1] = True, ["k1" in REFINED_PARAMETERS[camera.model] for camera in cameras]
+    return lenses.held(~simple)
 
 
 def _told(best: Adjustment, fitted: Evidence, prior: PosePrior, kept: Lenses) -> NDArray[np.bool_]:
