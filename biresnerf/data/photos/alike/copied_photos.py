@@ -24,6 +24,7 @@ from biresnerf.data.photos.image_files import (
     quiet_pillow,
 )
 from biresnerf.data.photos.orientation import turned, turned_size
+from biresnerf.data.photos.photo_folders import few_names
 from biresnerf.errors import InputError
 from biresnerf.geometry.pose_error import rotation_between_deg
 
@@ -62,12 +63,9 @@ def without_copies(dataset: Dataset, keep: Sequence[str] = ()) -> Dataset:
         f"{copy} (of {original}{', compressed again' if copy in again else ''})"
         for copy, original in copies.items()
     ]
-    listed = ", ".join(named[:MOST_NAMED]) + (
-        f" and {len(named) - MOST_NAMED} more" * (len(named) > MOST_NAMED)
-    )
     note = (
         f"{len(copies)} of {len(dataset)} photos are copies of others, and are left out, as they tell nothing new: "
-        f"{listed}. A copy's pose is its original's.{_other_poses(dataset, copies)}"
+        f"{few_names(named, MOST_NAMED)}. A copy's pose is its original's.{_other_poses(dataset, copies)}"
     )
     return replace(part, warnings=(*part.warnings, note))
 
@@ -202,10 +200,9 @@ def _other_poses(dataset: Dataset, copies: Mapping[str, str]) -> str:
             apart.append(copy)
     if not apart:
         return ""
-    named = ", ".join(apart[:MOST_NAMED]) + f" and {len(apart) - MOST_NAMED} more" * (len(apart) > MOST_NAMED)
     return (
-        f" The input has other poses for {named} than for the same pictures under their other names; these were not "
-        "used. Is each file the photo that its pose was given for?"
+        f" The input has other poses for {few_names(apart, MOST_NAMED)} than for the same pictures under their "
+        "other names; these were not used. Is each file the photo that its pose was given for?"
     )
 
 
