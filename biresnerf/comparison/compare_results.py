@@ -95,6 +95,8 @@ def _far(found: PoseDifferences) -> str:
     which = f"{len(far)} of {len(found.rows)} photos"
     if len(far) <= NAMED and 2 * len(far) <= len(found.rows):
         which += f" ({', '.join(row.name for row in far)})"
+    if found.stated_deg is not None and turn <= FAR_BOUNDS * found.stated_deg:  # by where they lie alone
+        return f"the positions of {which} differ by more than {FAR_BOUNDS:g} times what both state"
     stated = (
         f"far more than the ± {found.stated_deg:.2g}° that they state together"
         if found.stated_deg is not None

@@ -129,6 +129,10 @@ def test_a_centre_far_off_contradicts_in_any_unit(scale: float) -> None:
     other = in_frame((report, poses.model_copy(update={"images": tuple(shifted)})), frame)
     said = compared(made(0.05, 0.2, 1), other)
     assert [pose.name for pose in said.poses if pose.contradicts] == [poses.images[3].name]
+    assert (
+        f"the positions of 1 of 32 photos ({poses.images[3].name}) differ by more than 3 times"
+        in said.conclusion
+    )
 
 
 def test_a_result_that_kept_the_input_is_judged_by_the_inputs_figures() -> None:
