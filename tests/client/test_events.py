@@ -117,13 +117,11 @@ async def test_what_is_no_stream_of_events_is_another_program() -> None:
 async def test_following_with_a_time_limit_never_waits_longer_for_a_silent_service() -> None:
     async def silent(request: httpx.Request) -> httpx.Response:
         await anyio.sleep(60)
-        raise AssertionError
+        raise AssertionError("waited for the service")
 
-    began = time.monotonic()
     with pytest.raises(JobNotOver, match=r"job_1 is not over after 0\.05 s") as caught:
         await followed(client_of(silent), timeout_s=0.05)  # type: ignore[arg-type]
     assert isinstance(caught.value, TimeoutError)
-    assert time.monotonic() - began < 5
 
 
 async def test_a_time_limit_holds_between_connections_and_within_one() -> None:
