@@ -139,7 +139,8 @@ class Clients:
         answer = await self.call(method, path, **request)
         if answer.status_code >= 300:
             raise RuntimeError(f"{method} {path}: {answer.status_code} {answer.text}")
-        found: dict[str, Any] = answer.json()
+        # A file that is sent again, as the first answer was lost, is answered by nothing.
+        found: dict[str, Any] = answer.json() if answer.content else {}
         return found
 
     async def call(self, method: str, path: str, **request: Any) -> httpx.Response:
