@@ -39,6 +39,10 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
     for column, preset in enumerate(get_args(PresetName))
 }
 
+# Of a run that names none. With a GPU the longer one is a matter of a minute.
+PRESET_ON: dict[ComputeDevice, PresetName] = {"cpu": "fast", "cuda": "balanced"}
+PRESET_IF_LEFT_OUT = "fast on a CPU, balanced on a GPU"
+
 # These keep their proportion to `steps`.
 FEWEST_STEPS, FEWEST_OF_STAGE = 20, 10  # of a run, and of what follows from its length
 SCALED_BY_STEPS = ("coarse_steps_min", "coarse_steps_max", "check_every", "warmup_steps")

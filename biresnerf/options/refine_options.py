@@ -25,6 +25,8 @@ from biresnerf.options.option import ONCE, Option, all_required, divided, lowere
 from biresnerf.options.presets import (
     FEWEST_OF_STAGE,
     FEWEST_STEPS,
+    PRESET_IF_LEFT_OUT,
+    PRESET_ON,
     ComputeDevice,
     MethodName,
     PresetName,
@@ -58,8 +60,9 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 
-    preset: Annotated[PresetName, Option("coarse", "Preset", level="usual")] = Field(
-        "balanced", description="Provides the value of every option that is left out."
+    preset: Annotated[PresetName | Open, Option("coarse", "Preset", level="usual")] = Field(
+        OPEN,
+        description=f"Provides the value of every option that is left out. Default: {PRESET_IF_LEFT_OUT}.",
     )
     method: Annotated[MethodName, Option("coarse", "Method", level="research")] = Field(
         "biresnerf",
@@ -324,7 +327,8 @@ class RefineOptions(_Options[None, Device]):
         Raises:
             InputError: ``invalid_options``: the requested values contradict those of the preset.
         """
-        values = preset_values(self.preset, self.method, device, self.steps)
+        preset = self.preset or PRESET_ON[device]
+        values = {"preset": preset, **preset_values(preset, self.method, device, self.steps)}
         return validated(ResolvedOptions, {**values, **self.model_dump(exclude_none=True), "device": device})
 
 

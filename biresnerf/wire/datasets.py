@@ -9,7 +9,7 @@ from urllib.parse import quote
 from pydantic import ConfigDict, Field, StringConstraints
 
 from biresnerf.options.given_poses import PoseQuestion
-from biresnerf.options.presets import PresetName
+from biresnerf.options.presets import PRESET_IF_LEFT_OUT, PresetName
 from biresnerf.report import IntrinsicsSource
 from biresnerf.wire.base import NO_CONTROLS, Links, Page, Record
 from biresnerf.wire.problems import JobError
@@ -54,6 +54,9 @@ class CheckReport(Record):
         examples=[{"fast": (95.0, 95.0), "balanced": (230.0, 690.0)}],
         description="The least and the most seconds that a job with each preset is expected to take on the idle "
         "machine that checked it: the same number twice where earlier jobs there measured all of it.",
+    )
+    preset: PresetName = Field(
+        "fast", description=f"Of a job that names none, on that machine: {PRESET_IF_LEFT_OUT}."
     )
 
 

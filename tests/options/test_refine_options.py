@@ -58,8 +58,16 @@ def test_resolved_options_refuse_what_is_left_open(missing: str):
         ResolvedOptions.model_validate({**values, missing: None})
 
 
+def test_a_run_that_names_no_preset_is_fast_on_a_cpu_and_balanced_on_a_gpu():
+    named = {device: RefineOptions().resolved(device) for device in ("cpu", "cuda")}
+    assert named == {
+        "cpu": RefineOptions(preset="fast").resolved("cpu"),
+        "cuda": RefineOptions(preset="balanced").resolved("cuda"),
+    }
+
+
 def test_a_gpu_takes_larger_images_and_batches_unless_they_are_asked_for():
-    cpu, cuda = (RefineOptions().resolved(device) for device in DEVICES)
+    cpu, cuda = (RefineOptions(preset="fast").resolved(device) for device in DEVICES)
     assert (cuda.max_image_size, cuda.samples_per_step) == (2 * cpu.max_image_size, 4 * cpu.samples_per_step)
     changed = {"device", "max_image_size", "samples_per_step"}
     assert cuda.model_dump(exclude=changed) == cpu.model_dump(exclude=changed)
@@ -70,7 +78,7 @@ def test_a_gpu_takes_larger_images_and_batches_unless_they_are_asked_for():
 
 
 def test_a_run_made_shorter_by_its_steps_alone_keeps_the_proportions():
-    whole, half = RefineOptions().resolved("cpu"), RefineOptions(steps=4000).resolved("cpu")
+    whole, half = (RefineOptions(preset="balanced", steps=steps).resolved("cpu") for steps in (None, 4000))
     for name in ("steps", "coarse_steps_min", "coarse_steps_max", "check_every", "warmup_steps"):
         assert getattr(half, name) == getattr(whole, name) / 2
 

@@ -130,7 +130,7 @@ def test_a_checked_set_shows_its_photos_and_cameras_and_leaves_photos_out(
         page.get_by_role("button", name="Refine the poses").click()
     job = sent.value.json()
     chosen = {"leave_out": ["./train/r_3"], "known_distance": distance}
-    assert job["options"] == {"preset": "balanced", **chosen}
+    assert job["options"] == {"preset": "fast", **chosen}
     api.post(f"/jobs/{job['id']}/cancel")
     assert tab.complaints == []
 
@@ -157,7 +157,7 @@ def test_poses_that_seem_to_mean_something_else_are_converted_with_a_click(
     with page.expect_response(lambda sent: sent.url.endswith("/v1/jobs")) as sent:
         page.get_by_role("button", name="Refine the poses").click()
     job = sent.value.json()
-    assert job["options"] == {"preset": "balanced", "given_poses": ["opencv_axes"]}
+    assert job["options"] == {"preset": "fast", "given_poses": ["opencv_axes"]}
     api.post(f"/jobs/{job['id']}/cancel")
     assert tab.complaints == []
 

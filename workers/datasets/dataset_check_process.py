@@ -71,7 +71,7 @@ def check(
     from biresnerf.data.photos.alike.copied_photos import without_copies
     from biresnerf.data.photos.alike.turning_object import turning_notes
     from biresnerf.data.photos.images import load_images
-    from workers.datasets.shown_set import expected_seconds, small_side, write_shown
+    from workers.datasets.shown_set import expected_seconds, preset_here, small_side, write_shown
 
     sent = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
     dataset = read_dataset(folder, within=folder)
@@ -93,6 +93,7 @@ def check(
         "warnings": [*without_copies(dataset).warnings, *turning_notes(dataset)],
         "pose_question": question and question.model_dump(mode="json"),
         "expected_s": expected_seconds(dataset, unbounded=images.background is None),
+        "preset": preset_here(),
     }
 
 

@@ -18,7 +18,7 @@ from biresnerf.data.show.view_pictures import CELL_PX, THUMBNAIL_PX, write_conta
 from biresnerf.data.workload import can_be_adjusted, workload
 from biresnerf.forecast.rates import latest_machine, machine_rates
 from biresnerf.options.given_poses import PoseReading
-from biresnerf.options.presets import PRESETS, ComputeDevice, PresetName
+from biresnerf.options.presets import PRESET_ON, PRESETS, ComputeDevice, PresetName
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.wire.datasets import CheckedCamera, CheckedPhoto, MaskPlace, PhotoList, PhotoSheet
 from workers.records import FIRST_PHOTO, PHOTO_LIST
@@ -88,8 +88,7 @@ def _inside(path: Path, folder: Path) -> str:
 
 def expected_seconds(dataset: Dataset, *, unbounded: bool) -> dict[PresetName, tuple[float, float]]:
     """Least and most seconds that a job with each preset would take, on a machine as that of the latest job here."""
-    kind, threads = latest_machine(usable_cores())
-    device: ComputeDevice = "cuda" if kind == "cuda" else "cpu"
+    device, threads = _latest_machine()
     rates, adjusts = machine_rates(device, threads), can_be_adjusted(len(as_views(dataset)))
     found: dict[PresetName, tuple[float, float]] = {}
     for preset in PRESETS:
@@ -97,3 +96,13 @@ def expected_seconds(dataset: Dataset, *, unbounded: bool) -> dict[PresetName, t
         work = workload(dataset, options, unbounded=unbounded, adjusts=adjusts)
         found[preset] = rates.between(work.amounts)
     return found
+
+
+def preset_here() -> PresetName:
+    """The preset of a job that names none, on a machine as that of the latest job here."""
+    return PRESET_ON[_latest_machine()[0]]
+
+
+def _latest_machine() -> tuple[ComputeDevice, int]:
+    kind, threads = latest_machine(usable_cores())
+    return ("cuda" if kind == "cuda" else "cpu"), threads

@@ -59,7 +59,8 @@ class Tools:
     ) -> dict[str, Any]:
         """Send a folder of photos, or a file with their poses, and queue a job.
 
-        Options: {"preset": "fast"} for minutes, "balanced" (the default) or "quality"; {"time_budget_s": 120}.
+        Options: {"preset": "fast"} for minutes (the default without a GPU), "balanced" (with one) or "quality";
+        {"time_budget_s": 120}.
         """
         async with self._service() as client:
             return self._told(await client.submit(path, options, name=name))

@@ -21,6 +21,7 @@ from biresnerf.commands.jobs.job_progress import SendingView
 from biresnerf.commands.jobs.service_options import service_at, service_options
 from biresnerf.commands.jobs.submit_several import name_of, require_several, submit_several
 from biresnerf.commands.settings_option import budget_option, settings_option
+from biresnerf.options.presets import PRESET_IF_LEFT_OUT
 from biresnerf.wire.jobs import DEADLINE_MOST_S
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ class _SetParameter(click.ParamType):
 
 @click.command("submit")
 @click.argument("paths", type=_SetParameter(), nargs=-1, required=True, metavar="PATH...")
-@click.option("--preset", help="fast, balanced, quality or paper.")
+@click.option("--preset", help=f"fast, balanced, quality or paper. Default: {PRESET_IF_LEFT_OUT}.")
 @budget_option
 @settings_option
 @follow_options

@@ -11,7 +11,7 @@ import click
 from biresnerf.commands.answers import json_option, show
 from biresnerf.commands.settings_option import settings_option
 from biresnerf.errors import InputError
-from biresnerf.options.presets import PRESETS, PresetName
+from biresnerf.options.presets import PRESET_IF_LEFT_OUT, PRESETS, PresetName
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions, parse_options
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 @click.option(
     "--preset",
     type=click.Choice(list(PRESETS)),
-    help="The preset that `refine` would use. Default: balanced.",
+    help=f"The preset that `refine` would use. Default: {PRESET_IF_LEFT_OUT}.",
 )
 @settings_option
 @click.option("--pixels", is_flag=True, help="Also decode every image, to find damaged ones.")

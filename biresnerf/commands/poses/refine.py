@@ -14,7 +14,7 @@ from biresnerf.commands import exit_codes
 from biresnerf.commands.answers import json_option, show
 from biresnerf.commands.settings_option import budget_option, settings_option
 from biresnerf.errors import Interrupted
-from biresnerf.options.presets import PRESETS
+from biresnerf.options.presets import PRESET_IF_LEFT_OUT, PRESETS
 from biresnerf.options.refine_options import parse_options
 from biresnerf.report import Report
 from biresnerf.run.stop_request import StopRequest
@@ -26,7 +26,7 @@ from biresnerf.viewer.report_html import REPORT_HTML
 @click.option(
     "--output", "-o", required=True, type=click.Path(path_type=Path), help="Folder for the results."
 )
-@click.option("--preset", type=click.Choice(list(PRESETS)), default=None, help="Default: balanced.")
+@click.option("--preset", type=click.Choice(list(PRESETS)), help=f"Default: {PRESET_IF_LEFT_OUT}.")
 @click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default=None, help="Default: auto.")
 @click.option("--seed", type=int, default=None, help="Default: 0.")
 @budget_option

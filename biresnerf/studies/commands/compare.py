@@ -20,7 +20,7 @@ from biresnerf.commands.answers import json_option, print_json
 from biresnerf.commands.machine.this_machine import describe_machine
 from biresnerf.commands.settings_option import parse_settings, settings_option
 from biresnerf.errors import InputError
-from biresnerf.options.presets import PRESETS
+from biresnerf.options.presets import PRESET_IF_LEFT_OUT, PRESETS
 
 if TYPE_CHECKING:
     from biresnerf.studies.plan import Entry, Plan, Variant
@@ -50,7 +50,11 @@ def comparison_options(command: Callable[..., Any]) -> Callable[..., Any]:
             "--output", "-o", required=True, type=click.Path(path_type=Path),
             help="Folder for cells and tables; finished cells are not run again.",
         ),
-        click.option("--preset", type=click.Choice(list(PRESETS)), help="Of all variants. Default: balanced."),
+        click.option(
+            "--preset",
+            type=click.Choice(list(PRESETS)),
+            help=f"Of all variants. Default: {PRESET_IF_LEFT_OUT}.",
+        ),
         settings_option,
         click.option("--size", type=click.IntRange(16, 4096), help="Long side (px): max_image_size of all variants."),
         click.option("--methods", metavar="A,B", help="Variants that differ in the option `method`."),

@@ -145,6 +145,7 @@ function JobCard({ job }: { job: JobView }) {
   const own = usePicture(job.thumbnail && `v1/jobs/${job.id}/artifacts/${job.thumbnail}`, job.stage ?? "");
   const photo = useServed(job.thumbnail || job.state === "expired" ? null : `v1/datasets/${job.dataset_id}/thumbnail.jpg`);
   const picture = own ?? photo;
+  const preset = job.options.preset ?? job.resolved_options?.preset;
   return (
     <a class="card job-card" href={`#/jobs/${job.id}`} onClick={() => (listView.scroll = scrollY)}>
       <span class="thumbnail">{picture && <img src={picture} alt="" width={96} height={72} loading="lazy" />}</span>
@@ -155,7 +156,8 @@ function JobCard({ job }: { job: JobView }) {
         </span>
         <ProgressBar job={job} />
         <span class="soft job-foot">
-          {moment(job.created_at)} · {String(job.options.preset ?? "balanced")}
+          {moment(job.created_at)}
+          {preset ? ` · ${String(preset)}` : ""}
           {job.expires_at && job.state !== "expired" && ` · kept until ${moment(job.expires_at)}`}
         </span>
       </span>

@@ -41,7 +41,7 @@ export function OptionsForm({ values, onChange, base, expected = {}, problems = 
   const fields = useMemo(() => view && fieldsOf(view.json_schema), [view]);
   if (problem) return <ProblemBox problem={problem} />;
   if (!view || !fields) return <p class="soft">Loading the options …</p>;
-  const preset = String(values.preset ?? base?.preset ?? "balanced");
+  const preset = String(values.preset ?? base?.preset ?? "fast");
   const fallback = (name: string) =>
     base && !values.preset && name in base ? words(base[name]) : presetValue(view, preset, name);
   const set = (name: string, value: unknown) => {

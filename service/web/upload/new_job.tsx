@@ -20,10 +20,10 @@ import { type SetPhotos, useSet } from "./set_photos";
 const carried = new Map<string, Values>();
 
 export function NewJob({ dataset }: { dataset: DatasetView }) {
-  const [values, setValues] = useState<Values>(carried.get(dataset.id) ?? { preset: "balanced" });
   const { attempt, busy, problem } = useAttempt();
   const photos = useSet(dataset.id);
   const report = dataset.report!;
+  const [values, setValues] = useState<Values>(carried.get(dataset.id) ?? { preset: report.preset });
   const named = values.leave_out;
   const leftOut = useMemo(() => new Set(Array.isArray(named) ? named.map(String) : []), [named]);
   const leaveOut = (names: ReadonlySet<string>) => {

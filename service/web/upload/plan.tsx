@@ -10,7 +10,7 @@ interface Props {
 }
 
 export function Plan({ report, values, leftOut }: Props) {
-  const seconds = report.expected_s[String(values.preset ?? "balanced") as keyof CheckReport["expected_s"]];
+  const seconds = report.expected_s[String(values.preset ?? report.preset) as keyof CheckReport["expected_s"]];
   const altered = ["steps", "time_budget_s", "max_image_size", "samples_per_step"].some((name) => name in values);
   return (
     <section class="card plan" aria-labelledby="plan-heading">

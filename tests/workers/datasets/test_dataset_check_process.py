@@ -38,7 +38,7 @@ def test_what_was_found_is_counted(tmp_path: Path) -> None:
         "images": 4, "with_pose": 3, "without_pose": 1, "poses": "partial", "cameras": 1,
         "camera_models": ["PINHOLE"], "intrinsics": ["given"], "format": "colmap", "masks": 1, "transparency": False,
         "warnings": ["1 of 4 images have no pose yet: d.png", "masks were found for 1 of 4 images"],
-        "pose_question": None, "expected_s": TIMES,
+        "pose_question": None, "expected_s": TIMES, "preset": "fast",
     }  # fmt: skip
 
 
