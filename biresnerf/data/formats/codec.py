@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
@@ -12,6 +13,7 @@ from biresnerf.data.formats.parsed_poses import ParsedPoses
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.errors import InputError
+from biresnerf.geometry.camera.camera_models import COEFFICIENTS, Camera
 from biresnerf.options.formats import Format
 
 
@@ -43,16 +45,72 @@ Writer: TypeAlias = Callable[[RefinedSet, Path, WriteContext], None]
 _HEAD_BYTES = 4096
 
 
-def head_holds(marker: bytes) -> Callable[[Path], bool]:
-    """Whether a file begins with something that holds ``marker``; for names that several programs use."""
+def head_of(path: Path) -> bytes:
+    """The first bytes of a file; none where there is no such file."""
+    if not path.is_file():
+        return b""
+    with path.open("rb") as file:
+        return file.read(_HEAD_BYTES)
 
-    def recognises(path: Path) -> bool:
-        if not path.is_file():
-            return False
-        with path.open("rb") as file:
-            return marker in file.read(_HEAD_BYTES)
 
-    return recognises
+def head_holds(*markers: bytes) -> Callable[[Path], bool]:
+    """Whether a file begins with something that holds one of these; for names that several programs use."""
+    return lambda path: any(marker in head_of(path) for marker in markers)
+
+
+def head_matches(pattern: bytes) -> Callable[[Path], bool]:
+    """Whether a file begins so."""
+    return lambda path: re.match(pattern, head_of(path)) is not None
+
+
+# The coefficients of Brown's lens, and of OpenCV's fisheye.
+BROWN, FISHEYE = ("k1", "k2", "k3", "p1", "p2"), ("k1", "k2", "k3", "k4")
+_CENTRED_PX = 1e-6
+_PINHOLE_HINT = "Export `pinhole`, which holds undistorted photos with PINHOLE cameras, and files of them."
+
+
+@dataclass(frozen=True)
+class LensLimits:
+    """What lenses a program has.
+
+    Attributes:
+        program: what people call it.
+        coefficients: of its perspective lens.
+        fisheye: of its fisheye; None where it has none.
+        two_focal_lengths: whether pixels may be other than square.
+        off_centre: whether the principal point may lie elsewhere than in the picture's middle.
+        hint: what to do with other lenses.
+    """
+
+    program: str
+    coefficients: Collection[str] = BROWN
+    fisheye: Collection[str] | None = FISHEYE
+    two_focal_lengths: bool = True
+    off_centre: bool = True
+    hint: str = _PINHOLE_HINT
+
+    def problem(self, camera: Camera) -> str | None:
+        """Why the program cannot hold this lens, or None where it can."""
+        full = camera.full()
+        known = self.fisheye if full.fisheye else self.coefficients
+        if known is None:
+            return f"{camera.model} is a fisheye"
+        if any(getattr(full, name) for name in COEFFICIENTS if name not in known):
+            return f"it does not have all coefficients of {camera.model}"
+        if full.fx != full.fy and not self.two_focal_lengths:
+            return "it has two focal lengths"
+        off = max(abs(full.cx - camera.width / 2), abs(full.cy - camera.height / 2))
+        return (
+            "its principal point is not in the image's centre"
+            if off > _CENTRED_PX and not self.off_centre
+            else None
+        )
+
+    def refuse(self, cameras: Iterable[Camera], where: str) -> None:
+        """Raises InputError ``export_not_possible`` for the first lens with a problem."""
+        for problem in filter(None, map(self.problem, cameras)):
+            what = f"{self.program} cannot hold a lens of this set: {problem}."
+            raise InputError("export_not_possible", what, where=where, hint=self.hint)
 
 
 @dataclass(frozen=True)

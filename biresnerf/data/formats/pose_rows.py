@@ -5,41 +5,58 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.formats.bad_frames import attempt
-from biresnerf.data.formats.colmap.model_checks import camera_of_numbers
-from biresnerf.data.formats.parsed_poses import FrameCamera, LensOf, ParsedPoses, PoseEntry
+from biresnerf.data.formats.bind_images import in_order
+from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, rigid_pose
+from biresnerf.data.formats.parsed_poses import Assignment, FrameCamera, LensOf, ParsedPoses, PoseEntry
+from biresnerf.data.model.colmap_scene import matrix_of_pose
+from biresnerf.data.model.conventions import OPENCV_FROM_OPENGL
 from biresnerf.data.model.dataset import SourceFormat
+from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.photos.image_files import ImageHeader
 from biresnerf.data.photos.photo_folders import images_in
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera, FullParameters, smallest_model
+from biresnerf.geometry.rigid import rigid_inverse
+from biresnerf.options.formats import Format
 
 MAX_ROWS = 100_000
 LEAST_SKEW_PX = 0.5  # at the upper and lower edge; less is left out
 MOST_SHEAR = 0.1  # of a scanned film; cameras have a thousandth
+ORDER_HINT = "Leave just the images that the poses are for; their order by name decides."
 Lens: TypeAlias = Camera | LensOf | None
 # ``world_from_cam`` [4, 4] (OpenCV axes) or None, and the lens.
 Placed: TypeAlias = tuple[NDArray[np.float64] | None, Lens]
-# The image's name, the place in the file, and what reads the row. Raises InputError.
-Row: TypeAlias = tuple[str, str, Callable[[], Placed]]
+# The image's name, the place in the file, and what stands there.
+Row: TypeAlias = tuple[str, str, Any]
 
 
 def parsed_rows(
-    dialect: str,
+    form: Format,
     files: Sequence[Path],
     rows: Iterable[Row],
+    read: Callable[[Any, str], Placed],
     *,
     notes: Sequence[str] = (),
     take_file_names: bool = False,
     photo_folders: Sequence[str] = (),
+    in_order_of_names: Literal["natural", "as text"] | None = None,
+    order_hint: str = ORDER_HINT,
 ) -> ParsedPoses:
     """The poses of ``rows``; a row that cannot be read keeps its problem.
+
+    Args:
+        form: what the rows are of.
+        read: gives pose and lens of what stands at a place. Raises InputError.
+        in_order_of_names: the rows name no images, but are in the order of their names, which is this one.
+        order_hint: where these are not as many.
 
     Raises:
         InputError: ``duplicate_image`` for a name that two rows have, ``pose_file_invalid`` for too many rows.
@@ -48,15 +65,22 @@ def parsed_rows(
     if len(rows) > MAX_ROWS:
         hint = "Split the set."
         raise InputError("pose_file_invalid", f"more than {MAX_ROWS} poses.", where=files[0].name, hint=hint)
-    entries = tuple(entry_of(*row) for row in rows)
+    entries = tuple(entry_of(name, where, partial(read, value, where)) for name, where, value in rows)
     twice = [name for name, count in Counter(entry.name for entry in entries).items() if count > 1]
     if twice:
         second = [entry for entry in entries if entry.name == twice[0]][1]
         detail = f"{twice[0]!r} is there twice."
         raise InputError("duplicate_image", detail, where=second.where, hint="Remove one.")
+
+    def in_order_of(names: Sequence[str]) -> Assignment:
+        as_text = in_order_of_names == "as text"
+        return in_order(entries, names, files[0].name, order_hint, as_text=as_text)
+
     return ParsedPoses(
-        SourceFormat(dialect, files=tuple(files)),
+        SourceFormat(form.name, files=tuple(files)),
         entries,
+        assign=in_order_of if in_order_of_names else None,
+        named=in_order_of_names is None,
         notes=tuple(notes),
         take_file_names=take_file_names,
         photo_folders=tuple(photo_folders),
@@ -70,6 +94,33 @@ def entry_of(name: str, where: str, read: Callable[[], Placed]) -> PoseEntry:
         return PoseEntry(name, None, where, problem=found)
     pose, lens = found
     return PoseEntry(name, pose, where, lens)
+
+
+def pose_by(form: Format, matrix: Any, where: str) -> NDArray[np.float64]:
+    """``world_from_cam`` [4, 4], OpenCV axes, of a file's matrix in the direction and with the axes of its format.
+
+    Args:
+        matrix: [3, 4] or [4, 4], as an array or as JSON has it.
+
+    Raises:
+        InputError: as `rigid_matrix` does.
+    """
+    rows = matrix.tolist() if isinstance(matrix, np.ndarray) else matrix
+    return _as_declared(form, rigid_matrix(rows, where)[0])
+
+
+def pose_of_numbers(
+    form: Format, quaternion: Sequence[float], position: Sequence[float], where: str, hint: str
+) -> NDArray[np.float64]:
+    """`pose_by` of a quaternion, in the order of its format, and a translation. Raises InputError as `rigid_pose`."""
+    a, b, c, d = quaternion
+    quat_wxyz = (d, a, b, c) if form.quaternion == "xyzw" else (a, b, c, d)
+    return _as_declared(form, matrix_of_pose(rigid_pose((*quat_wxyz, *position), where, hint)))
+
+
+def _as_declared(form: Format, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    world_from_cam = rigid_inverse(pose) if form.cam_from_world else pose
+    return world_from_cam @ (OPENCV_FROM_OPENGL if form.axes == "opengl" else np.eye(4))
 
 
 def lens_of(full: FullParameters, where: str, size: tuple[int, int]) -> Camera:

@@ -16,10 +16,10 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from biresnerf.data.formats.codec import head_of
 from biresnerf.data.photos.photo_folders import few_names, is_photo_name
 from biresnerf.errors import InputError
 
-FIRST_BYTES = 4096
 _DEPTH = 4  # of folders that are looked into: dslr/colmap/, dense/0/sparse/
 _MOST_FOLDERS = 2_000
 _RESULT = {"report.json", "config.json"}  # what a result of ours holds
@@ -59,7 +59,7 @@ def refuse_unread(root: Path) -> None:
     for form in UNREAD:
         for name in form.names:
             for path in sorted(root.glob(name)):
-                if path.is_file() and _begins(path, form.begins):
+                if path.is_file() and re.match(form.begins, head_of(path)):
                     raise InputError(
                         "poses_not_read",
                         f"holds camera poses of {form.program}, a form that is not read.",
@@ -67,11 +67,6 @@ def refuse_unread(root: Path) -> None:
                         hint="Convert them to one of the formats of docs/formats.md, or move them out of the folder to "
                         "have the poses found from the photos alone.",
                     )
-
-
-def _begins(path: Path, pattern: bytes) -> bool:
-    with path.open("rb") as file:
-        return re.match(pattern, file.read(FIRST_BYTES)) is not None
 
 
 def folders_of_set(root: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
@@ -100,7 +95,7 @@ def pose_like_notes(root: Path, names: Sequence[str], known: Sequence[Path] = ()
             f"{path.relative_to(root).as_posix()} holds camera poses of {form.program}, which are not read"
             for form in UNREAD
             for path in others
-            if any(fnmatch(path.name, name) for name in form.names) and _begins(path, form.begins)
+            if any(fnmatch(path.name, name) for name in form.names) and re.match(form.begins, head_of(path))
         ]
         own = [path for path in others if _stem(path.name) in stems and not _NO_POSES.search(path.name)]
         if len(own) >= max(3, len(stems) / 2):

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -42,15 +44,82 @@ def read_text(path: Path, most_bytes: int = MAX_TEXT_BYTES) -> str:
         raise invalid_file(path.name, "is not UTF-8 text.", hint) from None
 
 
-def finite_numbers(words: Sequence[str], where: str, hint: str) -> NDArray[np.float64]:
-    """The numbers that ``words`` stand for. Raises InputError ``pose_file_invalid`` or ``pose_not_finite``."""
+def finite_numbers(words: Sequence[str], where: str, hint: str, *counts: int) -> NDArray[np.float64]:
+    """The numbers that ``words`` stand for, as many as one of ``counts`` where these are given.
+
+    Raises:
+        InputError: ``pose_file_invalid`` or ``pose_not_finite``.
+    """
     try:
         values = np.array([float(word) for word in words], dtype=np.float64)
     except ValueError:
         raise invalid_file(where, "holds a word that is not a number.", hint) from None
     if not np.isfinite(values).all():
         raise InputError("pose_not_finite", "NaN or an infinite number.", where=where, hint=hint)
+    if counts and len(words) not in counts:
+        raise invalid_file(where, f"has {len(words)} numbers, not {' or '.join(map(str, counts))}.", hint)
     return values
+
+
+@dataclass(frozen=True)
+class Table:
+    """A text table whose head names its columns.
+
+    Attributes:
+        head: the place of the line that names the columns.
+        columns: where those are whose meaning is known.
+        rows: place and cells of those below, stripped; blank lines and comments are left out.
+    """
+
+    head: str
+    columns: dict[str, int]
+    rows: tuple[tuple[str, list[str]], ...]
+
+    def cell(self, row: Sequence[str], meaning: str) -> str:
+        """The text of a column; empty where the table or the row lacks it."""
+        at = self.columns.get(meaning, len(row))
+        return row[at] if at < len(row) else ""
+
+    def numbers(self, row: Sequence[str], meanings: Sequence[str], where: str, hint: str) -> list[float]:
+        """The numbers in these columns. Raises InputError as `finite_numbers` does, also for a row that is cut off."""
+        if len(row) <= max(self.columns.values()):
+            raise invalid_file(where, f"has {len(row)} values, fewer than columns.", hint)
+        found: list[float] = finite_numbers([self.cell(row, one) for one in meanings], where, hint).tolist()
+        return found
+
+
+def read_table(
+    file: str,
+    lines: Sequence[str],
+    titles: Mapping[str, Sequence[str]],
+    is_head: Callable[[Collection[str]], bool],
+) -> Table | None:
+    """The table below the first line that is a head, between commas, semicolons or tabs; None where none is.
+
+    Args:
+        file: its name, for messages.
+        titles: what columns of a meaning are called, as patterns of small letters and digits, preferred ones first.
+        is_head: whether a line is the head, by the meanings that it has columns for.
+    """
+    for index, line in enumerate(lines):
+        separator = max(",;\t", key=line.count)
+        words = [re.sub(r"[^a-z0-9]", "", word.lower()) for word in line.split(separator)]
+        columns = {
+            meaning: at
+            for meaning, patterns in titles.items()
+            for pattern in reversed(patterns)
+            for at in reversed(range(len(words)))
+            if re.fullmatch(pattern, words[at])
+        }
+        if is_head(columns):
+            below = [(f"{file} line {n}", one) for n, one in enumerate(lines[index + 1 :], index + 2)]
+            below = [(where, one) for where, one in below if one.strip() and not one.startswith("#")]
+            rows = csv.reader((one for _, one in below), delimiter=separator)
+            told = [
+                (where, [cell.strip() for cell in row]) for (where, _), row in zip(below, rows, strict=False)
+            ]
+            return Table(f"{file} line {index + 1}", columns, tuple(told))
+    return None
 
 
 def invalid_file(where: str, what: str, hint: str) -> InputError:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from biresnerf.data.formats.colmap.write_binary import write_colmap_binary
 from biresnerf.data.formats.colmap.write_text import write_colmap_text
 from biresnerf.data.formats.read_dataset import read_dataset
-from biresnerf.data.formats.simple.bundler import bundler_problem, write_bundler
+from biresnerf.data.formats.simple.bundler import LENSES, write_bundler
 from biresnerf.data.formats.simple.trajectory import write_kitti, write_tum
 from biresnerf.data.formats.transforms.instant_ngp import write_transforms_ngp
 from biresnerf.data.formats.transforms.write_transforms import write_transforms
@@ -107,7 +107,7 @@ def test_lenses_poses_and_names_come_back_where_the_form_can_hold_them(
     poses = random_poses(rng, len(NAMES))
     dataset = image_set(folder, cameras, poses)
     too_much = form == "transforms_ngp.json" and model in ("FULL_OPENCV", "THIN_PRISM_FISHEYE", *SHAPES)
-    if too_much or (form == "bundle.out" and bundler_problem(cameras[0])):
+    if too_much or (form == "bundle.out" and LENSES.problem(cameras[0])):
         with pytest.raises(InputError) as caught:
             write_as(form, dataset, poses, folder)
         assert caught.value.code == "export_not_possible"

@@ -17,11 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.formats.codec import Codec, head_holds
-from biresnerf.data.formats.colmap.model_checks import rigid_pose
 from biresnerf.data.formats.parsed_poses import Assignment, ParsedPoses, PoseEntry
-from biresnerf.data.formats.pose_rows import Placed, Row, lens_of, parsed_rows
+from biresnerf.data.formats.pose_rows import Placed, Row, lens_of, parsed_rows, pose_of_numbers
 from biresnerf.data.formats.simple.times_of_images import MAX_TIME_APART_S, nearest_poses
-from biresnerf.data.model.colmap_scene import matrix_of_pose
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.untrusted_file import finite_numbers, invalid_file, read_text
 from biresnerf.errors import InputError
@@ -62,18 +60,16 @@ def parse_euroc(root: Path, file: Path) -> ParsedPoses:
                 where, f"has {len(words)} values, not a time, a position and a quaternion.", _HINT
             )
         x, y, z, *quat_wxyz = finite_numbers(words[1:_COLUMNS], where, _HINT).tolist()
-        world_from_body = matrix_of_pose(rigid_pose((*quat_wxyz, x, y, z), where, _HINT))
-        return world_from_body @ body_from_cam, lens
+        return pose_of_numbers(EUROC, quat_wxyz, (x, y, z), where, _HINT) @ body_from_cam, lens
 
     rows: list[Row] = []
     for number, line in enumerate(read_text(file).splitlines(), start=1):
         words = [word.strip() for word in line.split(",")]
         if words[0] and not words[0].startswith("#"):
-            where = f"{file.name} line {number}"
-            rows.append((words[0], where, partial(read, words, where)))
+            rows.append((words[0], f"{file.name} line {number}", words))
     photos = sensor.parent / "data"
     folder = photos.relative_to(root).as_posix() if photos.is_relative_to(root) else "data"
-    parsed = parsed_rows("euroc", [file, sensor], rows, photo_folders=(folder,))
+    parsed = parsed_rows(EUROC, [file, sensor], rows, read, photo_folders=(folder,))
     times = [_seconds(entry.name, entry.where) for entry in parsed.entries]
     timed = tuple(replace(entry, timestamp_s=time) for entry, time in zip(parsed.entries, times, strict=True))
     return replace(parsed, entries=timed, assign=partial(_by_time, timed, file, lens), named=False)
@@ -112,11 +108,9 @@ def _read_sensor(file: Path) -> tuple[NDArray[np.float64], Camera]:
 
     def numbers(key: str, count: int) -> list[float]:
         match = re.search(rf"\b{key}:[^\[\]]{{0,200}}\[([^\]]{{0,2000}})\]", text)
-        where = f"cam0/{file.name} {key}"
-        found = finite_numbers(match[1].replace(",", " ").split() if match else [], where, _HINT).tolist()
-        if len(found) != count:
-            raise invalid_file(where, f"is not {count} numbers.", _HINT)
-        return [float(value) for value in found]
+        words = match[1].replace(",", " ").split() if match else []
+        found: list[float] = finite_numbers(words, f"cam0/{file.name} {key}", _HINT, count).tolist()
+        return found
 
     matrix = np.reshape(numbers("T_BS", 16), (4, 4)).tolist()  # cols and rows stand between
     body_from_cam = rigid_matrix(matrix, f"cam0/{file.name} T_BS")[0]

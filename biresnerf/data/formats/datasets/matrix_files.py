@@ -12,19 +12,15 @@ ScanNet's axes: nerfstudio's scannet_dataparser.py. A pose that was lost is infi
 from __future__ import annotations
 
 import re
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.formats.bad_frames import attempt
-from biresnerf.data.formats.codec import Codec
+from biresnerf.data.formats.codec import Codec, head_matches
 from biresnerf.data.formats.parsed_poses import LensOf, ParsedPoses
-from biresnerf.data.formats.pose_rows import Placed, Row, at_size_of, parsed_rows, pinhole_of
-from biresnerf.data.model.pose_validation import rigid_matrix
+from biresnerf.data.formats.pose_rows import Placed, at_size_of, parsed_rows, pinhole_of, pose_by
 from biresnerf.data.model.untrusted_file import finite_numbers, invalid_file, read_text
-from biresnerf.errors import InputError
 from biresnerf.options.formats import Format
 
 MATRIX_FILES = Format(
@@ -40,7 +36,8 @@ _FOLDERS = ("pose", "poses")
 _FRAME = re.compile(r"(.*frame-\d+)\.pose\.txt$")  # 7-Scenes and 3DMatch, beside NAME.color.png
 _SHARED = ("intrinsic/intrinsic_color.txt", "intrinsics.txt", "camera-intrinsics.txt")
 _OWN = {"intrinsic": 0.0, "intrinsics": 0.5}  # folders, and where the first pixel's middle lies
-_HEAD_BYTES = 4096
+_NUMBER = rb"[-+]?(?:[\d.]+(?:e[-+]?\d+)?|inf|nan)"
+_MATRIX = rb"(?i)\s*(?:%b\s+){11}(?:(?:%b\s+){4})?%b\s*\Z" % (_NUMBER, _NUMBER, _NUMBER)
 
 
 def parse_matrix_files(_root: Path, place: Path) -> ParsedPoses:
@@ -52,21 +49,18 @@ def parse_matrix_files(_root: Path, place: Path) -> ParsedPoses:
     files = _pose_files(place)
     root = _image_root(place)
     shared = next((root / name for name in _SHARED if (root / name).is_file()), None)
-    shared_lens = None if shared is None else attempt(partial(_lens, shared))
-    if isinstance(shared_lens, InputError):
-        raise shared_lens
+    shared_lens = None if shared is None else _lens(shared)
 
-    def read(file: Path) -> Placed:
+    def read(file: Path, where: str) -> Placed:
         own = next((path for name in _OWN if (path := root / name / file.name).is_file()), None)
         lens = shared_lens if own is None else _lens(own)
-        values = finite_numbers(read_text(file).split(), file.name, _HINT)
-        if len(values) not in (12, 16):
-            raise invalid_file(file.name, f"has {len(values)} numbers, not 16.", _HINT)
-        return rigid_matrix(values.reshape(-1, 4).tolist(), file.name)[0], lens
+        values = finite_numbers(read_text(file).split(), where, _HINT, 12, 16)
+        return pose_by(MATRIX_FILES, values.reshape(-1, 4), where), lens
 
-    rows: list[Row] = [(name, file.name, partial(read, file)) for name, file in files.items()]
+    rows = [(name, file.name, file) for name, file in files.items()]
     used = [*files.values(), *([shared] if shared else [])]
-    return parsed_rows("matrix-files", used, rows, take_file_names=True, photo_folders=("color", "image"))
+    folders = ("color", "image")
+    return parsed_rows(MATRIX_FILES, used, rows, read, take_file_names=True, photo_folders=folders)
 
 
 def _pose_files(place: Path) -> dict[str, Path]:
@@ -82,20 +76,9 @@ def _pose_files(place: Path) -> dict[str, Path]:
 
 
 def _recognises(place: Path) -> bool:
-    """Whether the first file begins with the numbers of a matrix, and nothing else."""
+    """Whether the first file holds the numbers of a matrix, and nothing else."""
     first = next(iter(_pose_files(place).values()), None) if place.is_dir() else None
-    if first is None:
-        return False
-    with first.open("rb") as file:
-        words = file.read(_HEAD_BYTES).decode("latin-1").split()
-    return len(words) in (12, 16) and not isinstance(attempt(partial(_floats, words)), InputError)
-
-
-def _floats(words: list[str]) -> list[float]:
-    try:
-        return [float(word) for word in words]
-    except ValueError:
-        raise invalid_file("", "holds a word that is not a number.", _HINT) from None
+    return first is not None and head_matches(_MATRIX)(first)
 
 
 def _lens(file: Path) -> LensOf:

@@ -12,27 +12,21 @@ import re
 import zipfile
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.formats.bind_images import in_order
-from biresnerf.data.formats.codec import Codec
+from biresnerf.data.formats.codec import Codec, LensLimits
 from biresnerf.data.formats.parsed_poses import Assignment, ParsedPoses
-from biresnerf.data.formats.pose_rows import Placed, Row, at_size_of, parsed_rows, pinhole_of
-from biresnerf.data.formats.simple.bundler import refuse_lenses
+from biresnerf.data.formats.pose_rows import Placed, at_size_of, parsed_rows, pinhole_of, pose_by
 from biresnerf.data.formats.simple.llff import rows_by_name
 from biresnerf.data.model.array_file import npz_numbers
 from biresnerf.data.model.atomic_file import whole_file
-from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.model.untrusted_file import invalid_file
 from biresnerf.errors import InputError
-from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.focus import focus_point
-from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.options.formats import Format
 
 NEUS = Format(
@@ -43,6 +37,7 @@ NEUS = Format(
     suffixes=(".npz",),
     gives="poses, one lens an image",
     checked_against="its writer; jingz666/NeuF",
+    cam_from_world=True,
     in_set="cameras_sphere.npz",
     loses=("names", "distortion", "rigs", "points", "mask paths"),
     instead="pinhole",
@@ -66,15 +61,9 @@ def parse_neus(_root: Path, file: Path) -> ParsedPoses:
     Raises:
         InputError: codes as in docs/input.md.
     """
-    matrices = _world_matrices(file)
-
-    def read(number: int) -> Placed:
-        return _decomposed(matrices[number], f"{file.name} world_mat_{number}")
-
-    rows: list[Row] = [
-        (str(number), f"{file.name} world_mat_{number}", partial(read, number)) for number in sorted(matrices)
-    ]
-    parsed = parsed_rows("neus", [file], rows, photo_folders=("image", "rgb"))
+    rows = [(str(n), f"{file.name} world_mat_{n}", one) for n, one in sorted(_world_matrices(file).items())]
+    folders = ("image", "rgb")
+    parsed = parsed_rows(NEUS, [file], rows, _decomposed, photo_folders=folders, in_order_of_names="as text")
 
     def assign(names: Sequence[str]) -> Assignment:
         numbers = [PurePosixPath(name).stem for name in names]
@@ -87,10 +76,10 @@ def parse_neus(_root: Path, file: Path) -> ParsedPoses:
                 for name, stem in zip(names, numbers, strict=True)
             ]
             return found, [f"{file.name}: images were taken by their numbers"]
-        hint = "Leave in image/ just the images that the cameras are for; their order by name decides."
-        return in_order(parsed.entries, names, file.name, hint, as_text=True)
+        assert parsed.assign is not None
+        return parsed.assign(names)
 
-    return replace(parsed, assign=assign, named=False)
+    return replace(parsed, assign=assign)
 
 
 def _world_matrices(file: Path) -> dict[int, NDArray[np.float64]]:
@@ -116,8 +105,7 @@ def _decomposed(matrix: NDArray[np.float64], where: str) -> Placed:
     if np.diag(lens).min() <= 1e-12 * np.abs(lens).max():
         raise invalid_file(where, "is no projection of a camera.", _HINT)
     cam_from_world = np.column_stack([rotation, np.linalg.solve(lens, projection[:, 3])])
-    pose = rigid_inverse(rigid_matrix(cam_from_world.tolist(), where)[0])
-    return pose, at_size_of(pinhole_of(lens / lens[2, 2], where, 0.0))
+    return pose_by(NEUS, cam_from_world, where), at_size_of(pinhole_of(lens / lens[2, 2], where, 0.0))
 
 
 def _recognises(file: Path) -> bool:
@@ -137,7 +125,7 @@ def write_neus(refined: RefinedSet, path: Path) -> None:
         InputError: ``export_not_possible``: a distorted lens.
     """
     hint = "Convert to pinhole, which undistorts the photos, then that folder to neus."
-    refuse_lenses(refined.cameras, _problem, "NeuS", path.name, hint)
+    LensLimits("NeuS", (), fisheye=None, hint=hint).refuse(refined.cameras, path.name)
     scale = _sphere(refined)
     matrices = {}
     for row, index in enumerate(rows_by_name(refined)):
@@ -148,13 +136,6 @@ def write_neus(refined: RefinedSet, path: Path) -> None:
         matrices[f"scale_mat_{row}"] = scale
     with whole_file(path) as temporary, temporary.open("wb") as file:
         np.savez(file, **matrices)
-
-
-def _problem(camera: Camera) -> str | None:
-    full = camera.full()
-    if full.fisheye:
-        return f"{camera.model} is a fisheye"
-    return "it is distorted" if full.distorted else None
 
 
 def _sphere(refined: RefinedSet) -> NDArray[np.float64]:

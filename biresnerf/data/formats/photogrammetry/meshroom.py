@@ -20,11 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from biresnerf.data.formats.codec import Codec, head_holds
+from biresnerf.data.formats.codec import BROWN, FISHEYE, Codec, LensLimits, head_holds
 from biresnerf.data.formats.colmap.model_checks import listed_name
 from biresnerf.data.formats.parsed_poses import ParsedPoses
 from biresnerf.data.formats.photogrammetry.landmarks import Landmark, landmarks
-from biresnerf.data.formats.photogrammetry.lens_limits import BROWN, FISHEYE, refuse_other_lenses
 from biresnerf.data.formats.photogrammetry.views import View, listed, parsed_views, pose_of_centre
 from biresnerf.data.formats.pose_rows import folder_with_photos, lens_of
 from biresnerf.data.model.atomic_file import write_json
@@ -126,7 +125,7 @@ def parse_meshroom(_root: Path, file: Path) -> ParsedPoses:
     }
     rows = listed(document, "views", file, _HINT)
     views = [_view(row, f"{file.name} views[{index}]") for index, row in enumerate(rows)]
-    return parsed_views("meshroom", file, views, poses, lenses)
+    return parsed_views(MESHROOM, file, views, poses, lenses)
 
 
 def _view(row: dict[str, Any], where: str) -> View:
@@ -183,7 +182,7 @@ def write_meshroom(refined: RefinedSet, path: Path) -> None:
     Raises:
         InputError: ``export_not_possible``: a lens that Meshroom does not have.
     """
-    refuse_other_lenses(refined, "Meshroom", path.name, fisheye=True, two_focal_lengths=False)
+    LensLimits("Meshroom", two_focal_lengths=False).refuse(refined.cameras, path.name)
     document = {
         "version": _strings(_VERSION),
         "views": [

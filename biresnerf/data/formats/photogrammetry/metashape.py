@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TypeAlias
 from xml.etree import ElementTree
@@ -22,9 +22,7 @@ from biresnerf.data.formats.codec import Codec, head_holds
 from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, image_name, supported_model
 from biresnerf.data.formats.parsed_poses import ParsedPoses
 from biresnerf.data.formats.photogrammetry.xml_file import read_xml
-from biresnerf.data.formats.pose_rows import Placed, entry_of, shear_of, without_skew
-from biresnerf.data.model.dataset import SourceFormat
-from biresnerf.data.model.pose_validation import rigid_matrix
+from biresnerf.data.formats.pose_rows import Placed, parsed_rows, pose_by, shear_of, without_skew
 from biresnerf.data.model.untrusted_file import finite_numbers, invalid_file
 from biresnerf.data.photos.panoramas.panorama import panorama_camera
 from biresnerf.data.photos.photo_folders import few_names
@@ -64,27 +62,34 @@ def parse_metashape(_root: Path, file: Path) -> ParsedPoses:
     )
     main = components.most_common(1)[0][0] if components else None
     by_id = {camera.get("id"): camera for camera in cameras.values()}
-    lenses: dict[str | None, Camera | InputError | None] = {}
-    entries, apart = [], []
-    for label, camera in sorted(cameras.items()):
-        where, sensor = f"{file.name} camera {label!r}", camera.get("sensor_id")
-        if sensor not in lenses:
-            lenses[sensor] = attempt(partial(_camera, sensors.get(sensor), f"{file.name} sensor {sensor}"))
-        master = by_id.get(camera.get("master_id"))
+
+    @cache
+    def lens_of(sensor: str | None) -> Camera | InputError | None:
+        return attempt(partial(_camera, sensors.get(sensor), f"{file.name} sensor {sensor}"))
+
+    def read(camera: ElementTree.Element, where: str) -> Placed:
+        master, sensor = by_id.get(camera.get("master_id")), camera.get("sensor_id")
         rig = None if master is None else (master, sensors.get(sensor))
-        entry = entry_of(label, where, partial(_read, camera, rig, lenses[sensor], where))
-        placed = camera if master is None else master
-        if entry.world_from_cam is not None and placed.get("component_id") != main:
-            entry = replace(entry, world_from_cam=None)
-            apart.append(label)
-        entries.append(entry)
+        return _read(camera, rig, lens_of(sensor), where)
+
+    rows = [(label, f"{file.name} camera {label!r}", camera) for label, camera in sorted(cameras.items())]
+    parsed = parsed_rows(METASHAPE, [file], rows, read, take_file_names=True)
+    placed = {label: by_id.get(camera.get("master_id"), camera) for label, camera in cameras.items()}
+    entries = tuple(
+        entry if placed[entry.name].get("component_id") == main else replace(entry, world_from_cam=None)
+        for entry in parsed.entries
+    )
+    apart = [
+        new.name
+        for old, new in zip(parsed.entries, entries, strict=True)
+        if old.world_from_cam is not new.world_from_cam
+    ]
     notes = [f"{file.name}: poses are in the chunk's own frame; its transform was not applied"]
     if apart:
         notes.append(
             f"{len(apart)} images belong to another component; their poses were not taken: {few_names(apart)}"
         )
-    source = SourceFormat("metashape", files=(file,))
-    return ParsedPoses(source, tuple(entries), notes=tuple(notes), take_file_names=True)
+    return replace(parsed, entries=entries, notes=tuple(notes))
 
 
 def the_chunk(file: Path) -> ElementTree.Element:
@@ -130,21 +135,19 @@ def _read(camera: ElementTree.Element, rig: _Rig, lens: Camera | InputError | No
 
 
 def _master_from_sensor(sensor: ElementTree.Element, where: str) -> NDArray[np.float64]:
-    rotation = finite_numbers((sensor.findtext("rotation") or "1 0 0 0 1 0 0 0 1").split(), where, _HINT)
-    location = finite_numbers((sensor.findtext("location") or "0 0 0").split(), where, _HINT)
-    if (len(rotation), len(location)) != (9, 3):
-        raise invalid_file(where, "the sensor's rotation has not 9 numbers, or its location not 3.", _HINT)
-    return rigid_matrix(np.column_stack([rotation.reshape(3, 3), location]).tolist(), where)[0]
+    words = (sensor.findtext("rotation") or "1 0 0 0 1 0 0 0 1").split()
+    rotation = finite_numbers(words, f"{where} sensor rotation", _HINT, 9).reshape(3, 3)
+    words = (sensor.findtext("location") or "0 0 0").split()
+    location = finite_numbers(words, f"{where} sensor location", _HINT, 3)
+    return pose_by(METASHAPE, np.column_stack([rotation, location]), where)
 
 
 def _pose(entry: ElementTree.Element, where: str) -> NDArray[np.float64] | None:
     transform = entry.find("transform")
     if transform is None:
         return None
-    values = finite_numbers((transform.text or "").split(), where, _HINT)
-    if len(values) != 16:
-        raise invalid_file(where, f"the transform has {len(values)} numbers, not 16.", _HINT)
-    return rigid_matrix(np.reshape(values, (4, 4)).tolist(), where)[0]
+    values = finite_numbers((transform.text or "").split(), f"{where} transform", _HINT, 16)
+    return pose_by(METASHAPE, values.reshape(4, 4), where)
 
 
 def _camera(sensor: ElementTree.Element | None, where: str) -> Camera | None:

@@ -6,21 +6,18 @@ OpenDroneMap/ODM. Lenses are OpenSfM's, in cameras.json of the project; with sev
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 from pydantic import BaseModel
 
-from biresnerf.data.formats.bad_frames import attempt
 from biresnerf.data.formats.codec import Codec, head_holds
 from biresnerf.data.formats.colmap.model_checks import image_name
 from biresnerf.data.formats.parsed_poses import LensOf, ParsedPoses
 from biresnerf.data.formats.photogrammetry.opensfm import read_lens, world_from_cam_of_vector
 from biresnerf.data.formats.pose_rows import Placed, Row, folder_with_photos, parsed_rows
 from biresnerf.data.model.untrusted_file import checked, invalid_file, read_json_object
-from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.options.formats import Format
 
@@ -57,9 +54,7 @@ def parse_odm(root: Path, file: Path) -> ParsedPoses:
     if not isinstance(features, list) or not features:
         raise invalid_file(f"{file.name} features", "has no list of shots.", _HINT)
     lens_files = [path for path in (root / _LENSES, file.parent.parent / _LENSES) if path.is_file()][:1]
-    shared = attempt(partial(_shared_lens, lens_files[0])) if lens_files else None
-    if isinstance(shared, InputError):
-        raise shared
+    shared = _shared_lens(lens_files[0]) if lens_files else None
 
     def read(shot: _Shot, where: str) -> Placed:
         pose = world_from_cam_of_vector(shot.rotation, (0.0, 0.0, 0.0), where)
@@ -72,8 +67,8 @@ def parse_odm(root: Path, file: Path) -> ParsedPoses:
     for index, feature in enumerate(features):
         where = f"{file.name} features[{index}]"
         shot = checked(_Shot, feature.get("properties") if isinstance(feature, dict) else None, where, _HINT)
-        rows.append((image_name(shot.filename, where), where, partial(read, shot, where)))
-    return parsed_rows("odm", [file, *lens_files], rows)
+        rows.append((image_name(shot.filename, where), where, shot))
+    return parsed_rows(ODM, [file, *lens_files], rows, read)
 
 
 def _shared_lens(file: Path) -> Camera | LensOf | None:

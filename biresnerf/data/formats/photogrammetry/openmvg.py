@@ -17,11 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from biresnerf.data.formats.codec import Codec, head_holds
+from biresnerf.data.formats.codec import BROWN, FISHEYE, Codec, LensLimits, head_holds
 from biresnerf.data.formats.colmap.model_checks import listed_name
 from biresnerf.data.formats.parsed_poses import ParsedPoses
 from biresnerf.data.formats.photogrammetry.landmarks import Landmark, landmarks
-from biresnerf.data.formats.photogrammetry.lens_limits import BROWN, FISHEYE, refuse_other_lenses
 from biresnerf.data.formats.photogrammetry.views import View, listed, parsed_views, pose_of_centre
 from biresnerf.data.formats.pose_rows import folder_with_photos, lens_of
 from biresnerf.data.model.atomic_file import write_json
@@ -114,7 +113,7 @@ def parse_openmvg(_root: Path, file: Path) -> ParsedPoses:
         number: partial(_read_lens, _pointed(value), where) for number, value, where in numbered("intrinsics")
     }
     views = [view(_pointed(value), where) for _, value, where in numbered("views")]
-    return parsed_views("openmvg", file, views, poses, lenses)
+    return parsed_views(OPENMVG, file, views, poses, lenses)
 
 
 def _pointed(value: Any) -> Any:
@@ -153,7 +152,7 @@ def write_openmvg(refined: RefinedSet, path: Path) -> None:
     Raises:
         InputError: ``export_not_possible``: a lens that OpenMVG does not have.
     """
-    refuse_other_lenses(refined, "OpenMVG", path.name, fisheye=True, two_focal_lengths=False)
+    LensLimits("OpenMVG", two_focal_lengths=False).refuse(refined.cameras, path.name)
     count = len(refined)
     views = [_pointer(row, {"polymorphic_id": _VIEW}, row + 1, _view(refined, row)) for row in range(count)]
     lenses: list[dict[str, Any]] = []

@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from biresnerf.data.formats.bad_frames import attempt
-from biresnerf.data.formats.codec import Codec, head_holds
+from biresnerf.data.formats.codec import BROWN, FISHEYE, Codec, LensLimits, head_holds
 from biresnerf.data.formats.colmap.model_checks import image_name, rigid_pose
 from biresnerf.data.formats.parsed_poses import LensOf, ParsedPoses, panorama_lens
-from biresnerf.data.formats.photogrammetry.lens_limits import BROWN, FISHEYE, refuse_other_lenses
 from biresnerf.data.formats.pose_rows import Placed, Row, at_size_of, folder_with_photos, lens_of, parsed_rows
 from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.colmap_scene import matrix_of_pose
@@ -122,10 +121,10 @@ def parse_opensfm(_root: Path, file: Path) -> ParsedPoses:
     rows: list[Row] = []
     for name, value in part["shots"].items():
         where = f"{place}.shots.{name}"
-        rows.append((image_name(name, where), where, partial(read, value, where)))
+        rows.append((image_name(name, where), where, value))
     others = sum(sizes) - max(sizes)
     notes = [f"{others} images belong to smaller reconstructions of {file.name}; their poses were not taken"]
-    return parsed_rows("opensfm", [file], rows, notes=notes if others else ())
+    return parsed_rows(OPENSFM, [file], rows, read, notes=notes if others else ())
 
 
 def world_from_cam_of_vector(rotation: _Vector, translation: _Vector, where: str) -> NDArray[np.float64]:
@@ -186,7 +185,7 @@ def write_opensfm(refined: RefinedSet, path: Path) -> None:
     Raises:
         InputError: ``export_not_possible``: a lens that OpenSfM does not have.
     """
-    refuse_other_lenses(refined, "OpenSfM", path.name, fisheye=True, two_focal_lengths=True)
+    LensLimits("OpenSfM").refuse(refined.cameras, path.name)
     shots = {}
     for image, pose in zip(refined.images, refined.cam_from_world, strict=True):
         shots[image.file_name.removeprefix(f"{IMAGE_FOLDER}/")] = {

@@ -14,22 +14,19 @@ import io
 import math
 from collections.abc import Sequence
 from contextlib import suppress
-from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.formats.codec import Codec, head_holds
+from biresnerf.data.formats.codec import Codec, LensLimits, head_holds
 from biresnerf.data.formats.colmap.model_checks import listed_name
 from biresnerf.data.formats.parsed_poses import LensOf, ParsedPoses
-from biresnerf.data.formats.photogrammetry.lens_limits import refuse_other_lenses
-from biresnerf.data.formats.pose_rows import Placed, Row, at_size_of, lens_of, parsed_rows
+from biresnerf.data.formats.pose_rows import Placed, at_size_of, lens_of, parsed_rows, pose_by
 from biresnerf.data.model.atomic_file import write_text
-from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.refined_set import RefinedSet
-from biresnerf.data.model.untrusted_file import finite_numbers, invalid_file, read_text
+from biresnerf.data.model.untrusted_file import Table, invalid_file, read_table, read_text
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera, FullParameters
 from biresnerf.options.formats import Format
@@ -51,7 +48,7 @@ REALITYCAPTURE = Format(
     hint="Internal/External camera parameters, by the photos' file names",
 )
 COLUMNS = (
-    "#name", "x", "y", "alt", "heading", "pitch", "roll", "f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2",
+    "name", "x", "y", "alt", "heading", "pitch", "roll", "f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2",
 )  # fmt: skip
 _FILM_MM = 36.0
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
@@ -59,7 +56,7 @@ _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 
 _HINT = "Export Internal/External camera parameters, with the columns name, x, y, alt, heading, pitch, roll and f."
 _NEEDED = COLUMNS[:8]
-_WITHOUT_LENS = ("#name", "x", "y", "z", "omega", "phi", "kappa")
+_WITHOUT_LENS = ("name", "x", "y", "z", "omega", "phi", "kappa")
 
 
 def parse_realitycapture(_root: Path, file: Path) -> ParsedPoses:
@@ -68,34 +65,30 @@ def parse_realitycapture(_root: Path, file: Path) -> ParsedPoses:
     Raises:
         InputError: codes as in docs/input.md.
     """
-    lines = read_text(file).splitlines()
-    start = next((index for index, line in enumerate(lines) if line.startswith(COLUMNS[0])), None)
-    if start is None:
-        raise invalid_file(file.name, f"has no line that begins with {COLUMNS[0]}.", _HINT)
-    head, *table = csv.reader(lines[start:])
-    columns = [name.strip() for name in head]
-    with_lens = "omega" not in columns
-    missing = [name for name in (_NEEDED if with_lens else _WITHOUT_LENS) if name not in columns]
-    if missing:
-        raise invalid_file(f"{file.name} line {start + 1}", f"has no column {missing[0]}.", _HINT)
+    titles = {name: (name,) for name in (*COLUMNS, *_WITHOUT_LENS)}
+    table = read_table(file.name, read_text(file).splitlines(), titles, lambda found: "name" in found)
+    if table is None:
+        raise invalid_file(file.name, "has no line that names a column name.", _HINT)
+    with_lens = "omega" not in table.columns
+    needed = _NEEDED if with_lens else _WITHOUT_LENS
+    if missing := [name for name in needed if name not in table.columns]:
+        raise invalid_file(table.head, f"has no column {missing[0]}.", _HINT)
 
-    def read(words: list[str], where: str) -> Placed:
-        if len(words) != len(columns):
-            raise invalid_file(where, f"has {len(words)} values for {len(columns)} columns.", _HINT)
-        given = {
-            name: word
-            for name, word in zip(columns, words, strict=True)
-            if name in (*COLUMNS[1:], *_WITHOUT_LENS[1:]) and word
-        }
-        numbers = finite_numbers(list(given.values()), where, _HINT).tolist()
-        value = dict.fromkeys(COLUMNS[1:], 0.0) | dict(zip(given, numbers, strict=True))
+    def read(row: list[str], where: str) -> Placed:
+        told = [
+            name
+            for name in table.columns
+            if name in needed[1:] or (name in COLUMNS[1:] and table.cell(row, name))
+        ]
+        value = dict.fromkeys(titles, 0.0) | dict(
+            zip(told, table.numbers(row, told, where, _HINT), strict=True)
+        )
         if with_lens:
             rotation = _about(2, -value["heading"]) @ _about(0, value["pitch"]) @ _about(1, value["roll"])
         else:
             rotation = _about(1, value["kappa"]) @ _about(0, value["phi"]) @ _about(2, -value["omega"])
         centre = [value["x"], value["y"], value["alt" if with_lens else "z"]]
-        matrix = np.column_stack([rotation @ _OPENGL_FROM_OPENCV, centre])
-        pose = rigid_matrix(matrix.tolist(), where)[0]
+        pose = pose_by(REALITYCAPTURE, np.column_stack([rotation, centre]), where)
         if not with_lens:
             return pose, None
         distortion = FilmLens(
@@ -104,25 +97,15 @@ def parse_realitycapture(_root: Path, file: Path) -> ParsedPoses:
         )  # fmt: skip
         return pose, lens_on_film(distortion, where)
 
-    name_at = columns.index(COLUMNS[0])
-    rows: list[Row] = []
-    for number, words in enumerate(table, start=start + 2):
-        if words:
-            where = f"{file.name} line {number}"
-            name = words[name_at] if name_at < len(words) else ""
-            rows.append((listed_name(name, where), where, partial(read, words, where)))
-    angles = ("heading", "pitch", "roll") if with_lens else ("omega", "phi", "kappa")
-    return parsed_rows(
-        "realitycapture", [file], rows, notes=_perhaps_radians(file.name, columns, table, angles)
-    )
+    rows = [(listed_name(table.cell(row, "name"), where), where, row) for where, row in table.rows]
+    notes = _perhaps_radians(file.name, table, needed[4:7])
+    return parsed_rows(REALITYCAPTURE, [file], rows, read, notes=notes)
 
 
-def _perhaps_radians(
-    file: str, columns: list[str], table: list[list[str]], angles: Sequence[str]
-) -> list[str]:
+def _perhaps_radians(file: str, table: Table, angles: Sequence[str]) -> list[str]:
     """A note where no angle of the table is larger than a whole turn is in radians, and some are no small ones."""
-    with suppress(ValueError, IndexError):  # rows that cannot be read say so themselves
-        largest = max(abs(float(words[columns.index(name)])) for words in table if words for name in angles)
+    with suppress(ValueError):  # rows that cannot be read say so themselves
+        largest = max(abs(float(table.cell(row, name))) for _, row in table.rows for name in angles)
         if math.pi / 4 < largest <= 2 * math.pi:
             return [
                 f"{file}: no angle is larger than {largest:.3g}. They were read as degrees, as RealityCapture "
@@ -186,7 +169,7 @@ def write_realitycapture(refined: RefinedSet, path: Path) -> None:
     Raises:
         InputError: ``export_not_possible``: a lens that the file cannot hold, or two photos of one file name.
     """
-    refuse_other_lenses(refined, "RealityCapture", path.name, fisheye=False, two_focal_lengths=False)
+    LensLimits("RealityCapture", fisheye=None, two_focal_lengths=False).refuse(refined.cameras, path.name)
     names = [PurePosixPath(image.file_name).name for image in refined.images]
     if len(set(names)) < len(names):
         raise InputError(
@@ -197,7 +180,7 @@ def write_realitycapture(refined: RefinedSet, path: Path) -> None:
         )
     file = io.StringIO()
     table = csv.writer(file, lineterminator="\n")
-    table.writerow(COLUMNS)
+    table.writerow((f"#{COLUMNS[0]}", *COLUMNS[1:]))
     for index, (name, pose) in enumerate(zip(names, refined.world_from_cam, strict=True)):
         camera = refined.camera_of(index)
         full, size = camera.full(), max(camera.width, camera.height)

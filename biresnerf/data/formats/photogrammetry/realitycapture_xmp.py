@@ -10,7 +10,6 @@ distortion was chosen.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +19,8 @@ from biresnerf.data.formats.parsed_poses import LensOf, ParsedPoses
 from biresnerf.data.formats.photogrammetry.realitycapture import FilmLens, lens_on_film
 from biresnerf.data.formats.photogrammetry.views import pose_of_centre
 from biresnerf.data.formats.photogrammetry.xml_file import read_xml
-from biresnerf.data.formats.pose_rows import Placed, Row, parsed_rows
-from biresnerf.data.model.untrusted_file import finite_numbers, invalid_file
+from biresnerf.data.formats.pose_rows import Placed, parsed_rows
+from biresnerf.data.model.untrusted_file import finite_numbers
 from biresnerf.errors import InputError
 from biresnerf.options.formats import Format
 
@@ -46,11 +45,11 @@ def parse_realitycapture_xmp(_root: Path, place: Path) -> ParsedPoses:
         InputError: codes as in docs/input.md.
     """
     files = [path for path in sorted(place.glob("*.xmp")) if _begins_so(path)]
-    rows: list[Row] = [(f"{path.stem}.jpg", path.name, partial(_read, path)) for path in files]
-    return parsed_rows("realitycapture-xmp", files, rows, take_file_names=True)
+    rows = [(f"{path.stem}.jpg", path.name, path) for path in files]
+    return parsed_rows(REALITYCAPTURE_XMP, files, rows, _read, take_file_names=True)
 
 
-def _read(file: Path) -> Placed:
+def _read(file: Path, where: str) -> Placed:
     values = {}
     for element in read_xml(file, _HINT).iter():
         for key, text in [*element.attrib.items(), (element.tag, element.text or "")]:
@@ -58,17 +57,14 @@ def _read(file: Path) -> Placed:
                 values[key.rpartition("}")[2]] = text
 
     def numbers(key: str, count: int) -> list[float]:
-        where = f"{file.name} xcr:{key}"
-        found = finite_numbers(values[key].split(), where, _HINT).tolist()
-        if len(found) != count:
-            raise invalid_file(where, f"has {len(found)} numbers, not {count}.", _HINT)
-        return [float(value) for value in found]
+        found: list[float] = finite_numbers(values[key].split(), f"{where} xcr:{key}", _HINT, count).tolist()
+        return found
 
-    lens = _lens(values, {key: numbers(key, 1)[0] for key in _LENS_KEYS if key in values}, numbers, file.name)
+    lens = _lens(values, {key: numbers(key, 1)[0] for key in _LENS_KEYS if key in values}, numbers, where)
     if "Position" not in values or "Rotation" not in values:
         return None, lens
     rotation = np.array(numbers("Rotation", 9)).reshape(3, 3)
-    return pose_of_centre(rotation.T, numbers("Position", 3), f"{file.name} xcr:Rotation"), lens
+    return pose_of_centre(rotation.T, numbers("Position", 3), f"{where} xcr:Rotation"), lens
 
 
 _LENS_KEYS = ("FocalLength35mm", "PrincipalPointU", "PrincipalPointV", "Skew", "AspectRatio")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from biresnerf.data.formats.bad_frames import attempt
 from biresnerf.data.formats.parsed_poses import ParsedPoses
-from biresnerf.data.formats.pose_rows import Placed, Row, parsed_rows
+from biresnerf.data.formats.pose_rows import Placed, parsed_rows
 from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.untrusted_file import invalid_file
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
+from biresnerf.options.formats import Format
 
 
 class View(NamedTuple):
@@ -33,7 +34,7 @@ class View(NamedTuple):
 
 
 def parsed_views(
-    dialect: str,
+    form: Format,
     file: Path,
     views: Iterable[View],
     poses: Mapping[str, Callable[[], NDArray[np.float64]]],
@@ -47,7 +48,7 @@ def parsed_views(
         missing = invalid_file(f"{file.name} intrinsics", f"lacks number {number}.", hint)
         return attempt(lenses[number]) if number in lenses else missing
 
-    def read(view: View) -> Placed:
+    def read(view: View, _where: str) -> Placed:
         found = lens_of(view.lens)
         for problem in (view.problem, found):
             if isinstance(problem, InputError):
@@ -55,8 +56,7 @@ def parsed_views(
         assert isinstance(found, Camera)
         return poses[view.pose]() if view.pose in poses else None, found
 
-    rows: list[Row] = [(view.name, view.where, partial(read, view)) for view in views]
-    return parsed_rows(dialect, [file], rows)
+    return parsed_rows(form, [file], [(view.name, view.where, view) for view in views], read)
 
 
 def pose_of_centre(

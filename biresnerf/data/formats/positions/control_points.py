@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import re
 from collections.abc import Iterator
@@ -16,7 +15,7 @@ from biresnerf.data.formats.positions.markers import is_marker, marked, refuse_w
 from biresnerf.data.formats.positions.position_table import WGS84, frame_of
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.measured_places import ControlPoints
-from biresnerf.data.model.untrusted_file import read_text
+from biresnerf.data.model.untrusted_file import read_table, read_text
 from biresnerf.data.photos.panoramas.cut_panoramas import place_in_view
 from biresnerf.errors import InputError
 from biresnerf.geometry.earth.geodesy import east_north_up
@@ -27,8 +26,11 @@ _HINT = (
     "name,x,y,z,image,px,py, or lat,lon,alt for x,y,z."
 )
 _CHECKS = {"1", "true", "yes", "check"}
-_ALIASES = {"label": "name", "photo": "image", "file": "image", "alt": "z", "height": "z", "latitude": "lat",
-            "longitude": "lon", "easting": "x", "northing": "y", "accuracyz": "zaccuracy"}  # fmt: skip
+_TITLES = {
+    "name": ("name", "label"), "check": ("check",), "image": ("image", "photo", "file"), "px": ("px",), "py": ("py",),
+    "lat": ("lat", "latitude"), "lon": ("lon", "longitude"), "x": ("x", "easting"), "y": ("y", "northing"),
+    "z": ("z", "alt", "height"), "accuracy": ("accuracy",), "zaccuracy": ("zaccuracy", "accuracyz"),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -150,35 +152,30 @@ def _of_csv(file: Path) -> tuple[list[_Row], bool, int | None]:
     """A header that names the columns; above it perhaps a line with the frame of x, y, z."""
     lines = read_text(file).splitlines()
     epsg = next((int(n) for line in lines[:2] for n in re.findall(r"EPSG:\s*(\d{4,6})", line, re.I)), None)
-    skipped = next((i for i, line in enumerate(lines) if "name" in line.lower()), None)
-    if skipped is None:
+    table = read_table(file.name, lines, _TITLES, lambda found: "name" in found)
+    if table is None:
         raise _invalid(file.name, "has no header with a column `name`.")
-    separator = max(",;\t", key=lines[skipped].count)
-    titles = [re.sub(r"[^a-z]", "", cell.lower()) for cell in lines[skipped].split(separator)]
-    titles = [_ALIASES.get(title, title) for title in titles]
-    degrees = "lat" in titles
+    degrees = "lat" in table.columns
     order = ("lat", "lon", "z") if degrees else ("x", "y", "z")
-    if missing := [name for name in order if name not in titles]:
+    if missing := [name for name in order if name not in table.columns]:
         raise _invalid(file.name, f"has no column for {', '.join(missing)}.")
-    rows = []
-    for number, cells in enumerate(csv.reader(lines[skipped + 1 :], delimiter=separator), skipped + 2):
-        cell = dict(zip(titles, (text.strip() for text in cells), strict=False))
-        if cell.get("name"):
-            rows.append(_csv_row(cell, order, f"{file.name} line {number}"))
+    rows = [
+        _csv_row({title: table.cell(row, title) for title in _TITLES}, order, where)
+        for where, row in table.rows
+        if table.cell(row, "name")
+    ]
     return rows, degrees, epsg or (WGS84 if degrees else None)
 
 
 def _csv_row(cell: dict[str, str], order: tuple[str, ...], where: str) -> _Row:
-    a, b, c = _numbers([cell.get(name, "") for name in order], where)
-    across = cell.get("accuracy") or "nan"
-    e, u = _numbers([across, cell.get("zaccuracy") or across], where, finite=False)
-    image, xy = cell.get("image", ""), (math.nan, math.nan)
+    a, b, c = _numbers([cell[name] for name in order], where)
+    across = cell["accuracy"] or "nan"
+    e, u = _numbers([across, cell["zaccuracy"] or across], where, finite=False)
+    image, xy = cell["image"], (math.nan, math.nan)
     if image:
-        px, py = _numbers([cell.get("px", ""), cell.get("py", "")], where)
+        px, py = _numbers([cell["px"], cell["py"]], where)
         xy = (px, py)
-    return _Row(
-        where, cell["name"], cell.get("check", "").lower() in _CHECKS, (a, b, c), (e, e, u), image, xy
-    )
+    return _Row(where, cell["name"], cell["check"].lower() in _CHECKS, (a, b, c), (e, e, u), image, xy)
 
 
 def _numbers(texts: list[str], where: str, *, finite: bool = True) -> Iterator[float]:

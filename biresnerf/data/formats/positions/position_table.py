@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from biresnerf.data.model.untrusted_file import read_text
+from biresnerf.data.model.untrusted_file import read_table, read_text
 from biresnerf.data.photos.geotags import MeasuredPlace
 from biresnerf.errors import InputError
 
@@ -80,8 +79,11 @@ def read_position_table(file: Path) -> PositionTable:
     if lines and re.match(r"\s*(EPSG:|WGS84 UTM|'?\+proj)", lines[blank], re.I):
         return _geo_txt(file.name, lines, blank)
     said = next((line for line in lines if "coordinatesystem" in line.lower().replace(" ", "")), "")
-    header, rows = _header_and_rows(file.name, lines)
-    longitudes = "xlongitude" in _plain(lines)
+    table = read_table(file.name, lines, _COLUMNS, _is_head)
+    if table is None:
+        raise _invalid(file.name, "has no header that names a name and three coordinates.")
+    header = table.columns
+    longitudes = "xlongitude" in re.sub(r"[^a-z\n]", "", "\n".join(lines).lower())
     degrees = "lat" in header or (longitudes and (not said.partition(":")[2] or is_geographic(said)))
     order = ("lat", "lon", "z") if "lat" in header else ("y", "x", "z") if degrees else ("x", "y", "z")
     missing = [name for name in ("name", *order[:2]) if name not in header]
@@ -89,55 +91,50 @@ def read_position_table(file: Path) -> PositionTable:
         raise _invalid(f"{file.name}", f"has no column for {', '.join(missing)}.")
     numbers = re.findall(EPSG, said)
     places: dict[str, MeasuredPlace] = {}
-    flat: list[int] = []
-    for number, cells in rows:
-        where = f"{file.name} line {number}"
-        texts = [_cell(cells, header[name]) if name in header else "" for name in order]
-        name = _cell(cells, header["name"])
+    flat: list[str] = []
+    for where, row in table.rows:
+        name, texts = table.cell(row, "name"), [table.cell(row, name) for name in order]
         if not name or not any(texts):  # Metashape lists photos without a reference, too
             continue
         if all(texts[:2]) and not texts[2]:
-            flat.append(number)
+            flat.append(where)
             continue
-        accuracy = [_cell(cells, header[key]) for key in ("accuracy", "zaccuracy") if key in header]
+        accuracy = [table.cell(row, key) for key in ("accuracy", "zaccuracy")]
         _add(places, name, texts, accuracy, where, degrees=degrees)
     epsg = WGS84 if degrees else int(numbers[-1]) if numbers else None
-    return PositionTable(file.name, places, degrees, epsg, _flat_notes(file.name, flat))
+    return PositionTable(file.name, places, degrees, epsg, _flat_notes(flat))
 
 
 def _geo_txt(source: str, lines: Sequence[str], first: int) -> PositionTable:
     """OpenDroneMap's: a frame, then names, x (or longitude), y (or latitude), perhaps height, angles and accuracies."""
-    rows: dict[int, list[str]] = {}
-    flat: list[int] = []
+    rows: dict[str, list[str]] = {}
+    flat: list[str] = []
     for number, line in enumerate(lines[first + 1 :], first + 2):
-        cells = line.split()
+        cells, where = line.split(), f"{source} line {number}"
         if not cells or cells[0].startswith("#"):
             continue
         if len(cells) < 3:
-            raise _invalid(f"{source} line {number}", "has less than a name and two numbers.")
+            raise _invalid(where, "has less than a name and two numbers.")
         if len(cells) == 3:
-            flat.append(number)
+            flat.append(where)
         else:
-            rows[number] = cells
+            rows[where] = cells
     degrees, metres, epsg = frame_of(lines[first], list(rows.values()), f"{source} line {first + 1}")
     places: dict[str, MeasuredPlace] = {}
-    for number, cells in rows.items():
-        where = f"{source} line {number}"
+    for where, cells in rows.items():
         x, y, z = cells[1:4]
         texts = [y, x, z] if degrees else [x, y, z]
         stated = cells[_ODM_ACCURACY : _ODM_ACCURACY + 2]
         _add(places, cells[0], texts, stated, where, degrees=degrees)
         a, b, c = places[cells[0]].place
         places[cells[0]] = places[cells[0]]._replace(place=(a * metres, b * metres, c))
-    return PositionTable(source, places, degrees, epsg, _flat_notes(source, flat))
+    return PositionTable(source, places, degrees, epsg, _flat_notes(flat))
 
 
-def _flat_notes(source: str, lines: Sequence[int]) -> tuple[str, ...]:
-    if not lines:
+def _flat_notes(places: Sequence[str]) -> tuple[str, ...]:
+    if not places:
         return ()
-    return (
-        f"{source} line {lines[0]} has no height: {len(lines)} positions without one are not used, {FLAT}",
-    )
+    return (f"{places[0]} has no height: {len(places)} positions without one are not used, {FLAT}",)
 
 
 def frame_of(header: str, rows: Sequence[Sequence[str]], where: str) -> tuple[bool, float, int | None]:
@@ -174,35 +171,8 @@ def _number(text: str) -> float:
         return 0.0
 
 
-def _header_and_rows(
-    source: str, lines: Sequence[str]
-) -> tuple[dict[str, int], Iterator[tuple[int, list[str]]]]:
-    for index, line in enumerate(lines):
-        separator = max(",;\t", key=line.count)
-        titles = [_plain([cell]) for cell in line.split(separator)]
-        header = {
-            meaning: titles.index(title)
-            for meaning, names in _COLUMNS.items()
-            for title in reversed(names)
-            if title in titles
-        }
-        if "name" in header and (
-            len(header) > 3 or {"lat", "lon"} <= header.keys() or {"x", "y"} <= header.keys()
-        ):
-            below = list(enumerate(lines[index + 1 :], index + 2))
-            told = [(number, line) for number, line in below if line.strip() and not line.startswith("#")]
-            cells = csv.reader((line for _, line in told), delimiter=separator)
-            return header, ((n, row) for (n, _), row in zip(told, cells, strict=False))
-    raise _invalid(source, "has no header that names a name and three coordinates.")
-
-
-def _plain(texts: Sequence[str]) -> str:
-    """Letters alone, small: ``#Label`` and ``X/Longitude`` as label and xlongitude."""
-    return re.sub(r"[^a-z\n]", "", "\n".join(texts).lower())
-
-
-def _cell(cells: Sequence[str], column: int) -> str:
-    return cells[column].strip() if column < len(cells) else ""
+def _is_head(found: Collection[str]) -> bool:
+    return "name" in found and (len(found) > 3 or {"lat", "lon"} <= {*found} or {"x", "y"} <= {*found})
 
 
 def _add(

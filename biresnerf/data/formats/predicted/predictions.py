@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from biresnerf.data.formats.bind_images import in_order
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.formats.parsed_poses import FrameCamera, ParsedPoses
-from biresnerf.data.formats.pose_rows import Placed, entry_of, lens_of
+from biresnerf.data.formats.pose_rows import ORDER_HINT, Placed, lens_of, parsed_rows, pose_by
 from biresnerf.data.formats.predicted.seen_pictures import (
     VGGT,
     Margin,
@@ -36,13 +36,10 @@ from biresnerf.data.model.array_file import (
     npz_rows,
     npz_shapes,
 )
-from biresnerf.data.model.dataset import SourceFormat
-from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.untrusted_file import invalid_file, read_bytes
 from biresnerf.data.photos.guessed_lens import refuse_other_units
 from biresnerf.data.photos.image_files import ImageHeader
 from biresnerf.errors import InputError
-from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.options.formats import Format
 
 FEED_FORWARD = Format(
@@ -76,7 +73,6 @@ _DEPTHS, _PICTURES = (
 _MOST_BYTES = 16 * 2**20
 _MOST_SMALL = 240  # px; the pictures of the smaller of DUSt3R's networks
 _HINT = "Give the file as the program wrote it, with poses [n, 4, 4] and a lens or a focal length for each."
-_ORDER_HINT = "Leave in images/ just the photos that the network was given; their order by name decides."
 Array = NDArray[np.float64]
 
 
@@ -156,29 +152,22 @@ def _margin(picture: Array, per_pixel: float) -> Margin:
     return Margin()
 
 
-def _parse(dialect: str, names: tuple[str, ...], file: Path) -> ParsedPoses:
+def _parse(form: Format, names: tuple[str, ...], file: Path) -> ParsedPoses:
     arrays = _Arrays(file)
     poses_name, lenses_name = arrays.name_of(names), arrays.name_of(_LENSES)
     if poses_name is None or lenses_name is None:
         raise invalid_file(file.name, "has no poses with a lens, or a focal length, for each.", _HINT)
     poses, focal, centre = arrays.numbers(poses_name), *_lenses(arrays, lenses_name)
-    inverse = names is _CAM_FROM_WORLD
     lens_at = _lens_at(arrays, focal, centre, poses_name)
 
     def read(number: int, where: str) -> Placed:
-        pose = rigid_matrix(poses[number].tolist(), where)[0]
-        return rigid_inverse(pose) if inverse else pose, partial(lens_at, number, where)
+        return pose_by(form, poses[number], where), partial(lens_at, number, where)
 
-    entries = tuple(
-        replace(entry_of(str(i), where, partial(read, i, where)), upright=not inverse)
-        for i, where in enumerate(f"{file.name} {poses_name}[{i}]" for i in range(arrays.count))
-    )
-    return ParsedPoses(
-        SourceFormat(dialect, files=arrays.files),
-        entries,
-        assign=lambda photos: in_order(entries, photos, file.name, _ORDER_HINT, as_text=True),
-        named=False,
-    )
+    rows = [(str(i), f"{file.name} {poses_name}[{i}]", i) for i in range(arrays.count)]
+    parsed = parsed_rows(form, arrays.files, rows, read)
+    entries = tuple(replace(entry, upright=not form.cam_from_world) for entry in parsed.entries)
+    assign = partial(in_order, entries, file=file.name, hint=ORDER_HINT, as_text=True)
+    return replace(parsed, entries=entries, assign=assign, named=False)
 
 
 def _lenses(arrays: _Arrays, name: str) -> tuple[Array, Array | None]:
@@ -241,13 +230,13 @@ def _root(file: Path) -> Path:
 CODECS = (
     Codec(
         FEED_FORWARD,
-        parse=lambda _root, file: _parse("feed-forward", _CAM_FROM_WORLD, file),
+        parse=lambda _root, file: _parse(FEED_FORWARD, _CAM_FROM_WORLD, file),
         recognises=partial(_recognises, _CAM_FROM_WORLD),
         image_root=_root,
     ),
     Codec(
         DUST3R,
-        parse=lambda _root, file: _parse("dust3r", _WORLD_FROM_CAM, file),
+        parse=lambda _root, file: _parse(DUST3R, _WORLD_FROM_CAM, file),
         recognises=partial(_recognises, _WORLD_FROM_CAM),
     ),
 )

@@ -6,28 +6,21 @@ image's centre. Format: Bundler v0.4 user's manual, section 6.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.formats.bad_frames import attempt
-from biresnerf.data.formats.bind_images import in_order
-from biresnerf.data.formats.codec import Codec
+from biresnerf.data.formats.codec import Codec, LensLimits
 from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, listed_name
-from biresnerf.data.formats.parsed_poses import FrameCamera, ParsedPoses, PoseEntry
+from biresnerf.data.formats.parsed_poses import ParsedPoses
+from biresnerf.data.formats.pose_rows import Placed, at_size_of, parsed_rows, pose_by
 from biresnerf.data.model.atomic_file import write_text
-from biresnerf.data.model.dataset import SourceFormat
-from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.model.untrusted_file import finite_numbers, invalid_file, read_text
-from biresnerf.data.photos.image_files import ImageHeader
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
-from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.options.formats import Format
 
 BUNDLER = Format(
@@ -50,11 +43,11 @@ BUNDLER = Format(
 )
 
 LIST_NAMES = ("list.txt", "bundle/list.txt", "list.rd.txt", "bundle/list.rd.txt")
-MAX_CAMERAS = 100_000
 _HINT = "Export the bundle file (v0.3) again."
+_LIST_HINT = "Give list.txt as it was written with the bundle file: one image a line, in its order."
 _LINES_PER_CAMERA, _LINES_PER_POINT = 5, 3
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
-_CENTRED_PX = 1e-6
+LENSES = LensLimits("Bundler", ("k1", "k2"), fisheye=None, two_focal_lengths=False, off_centre=False)
 
 
 def parse_bundler(root: Path, file: Path) -> ParsedPoses:
@@ -66,44 +59,25 @@ def parse_bundler(root: Path, file: Path) -> ParsedPoses:
     Raises:
         InputError: codes as in docs/input.md.
     """
-    cameras = read_cameras(file)
-    list_file, listed = _listed_names(root, file, len(cameras))
-    entries = []
-    for index, camera in enumerate(cameras):
-        where = f"{file.name} camera {index}"
-        name = str(index) if list_file is None else listed[index]
-        if isinstance(camera, InputError):
-            entries.append(PoseEntry(name, None, where, problem=camera))
-            continue
-        lens, pose = camera
-        entries.append(PoseEntry(name, pose, where, None if pose is None else partial(_camera, lens, where)))
-    files = (file,) if list_file is None else (file, list_file)
-    hint = "Give list.txt as it was written with the bundle file: one image a line, in its order."
-    return ParsedPoses(
-        SourceFormat("bundler", files=files),
-        tuple(entries),
-        assign=(lambda names: in_order(entries, names, file.name, hint)) if list_file is None else None,
-        named=list_file is not None,
-    )
+    blocks = _blocks(file)
+    list_file, listed = _listed_names(root, file, len(blocks))
+    files = [file] if list_file is None else [file, list_file]
+    rows = [
+        (name, f"{file.name} camera {at}", block)
+        for at, (name, block) in enumerate(zip(listed, blocks, strict=True))
+    ]
+    if list_file is not None:
+        return parsed_rows(BUNDLER, files, rows, _read)
+    return parsed_rows(BUNDLER, files, rows, _read, in_order_of_names="natural", order_hint=_LIST_HINT)
 
 
-Lens = tuple[float, float, float]
-
-
-BundlerCamera: TypeAlias = tuple[Lens, NDArray[np.float64] | None]
-
-
-def read_cameras(file: Path) -> list[BundlerCamera | InputError]:
-    """Focal length (px), k1, k2, and ``world_from_cam`` [4, 4] of each camera (None without a pose); or its error.
-
-    Raises:
-        InputError: ``pose_file_invalid`` where the file as a whole cannot be read.
-    """
+def _blocks(file: Path) -> list[list[list[str]]]:
+    """The words of the lines of each camera. Raises InputError ``pose_file_invalid``."""
     lines = [
         line.split() for line in read_text(file).splitlines() if line.strip() and not line.startswith("#")
     ]
     counts = _numbers(lines[:1], 1, 2, f"{file.name} first line")[0]
-    if not all(count == round(count) and count >= 0 for count in counts) or counts[0] > MAX_CAMERAS:
+    if not all(count == round(count) and count >= 0 for count in counts):
         raise invalid_file(
             f"{file.name} first line", "does not give the numbers of cameras and points.", _HINT
         )
@@ -115,23 +89,21 @@ def read_cameras(file: Path) -> list[BundlerCamera | InputError]:
             _HINT,
         )
     starts = [1 + _LINES_PER_CAMERA * index for index in range(cameras)]
-    return [
-        attempt(partial(_camera_of, lines[at : at + _LINES_PER_CAMERA], f"{file.name} camera {index}"))
-        for index, at in enumerate(starts)
-    ]
+    return [lines[at : at + _LINES_PER_CAMERA] for at in starts]
 
 
-def _camera_of(lines: Sequence[Sequence[str]], where: str) -> BundlerCamera:
+def _read(lines: list[list[str]], where: str) -> Placed:
     block = _numbers(lines, _LINES_PER_CAMERA, 3, where)
     focal, k1, k2 = block[0].tolist()
-    return (focal, k1, k2), None if focal == 0.0 else _world_from_cam(block[1:4], block[4], where)
+    if focal == 0.0:
+        return None, None
 
+    def lens(width: int, height: int) -> Camera:
+        full = (focal, width / 2, height / 2)
+        model, params = ("RADIAL", (*full, k1, k2)) if k1 or k2 else ("SIMPLE_PINHOLE", full)
+        return camera_of_numbers(model, width, height, params, where)
 
-def _world_from_cam(
-    rotation: NDArray[np.float64], translation: NDArray[np.float64], where: str
-) -> NDArray[np.float64]:
-    cam_from_world = _OPENCV_FROM_OPENGL @ np.column_stack([rotation, translation])
-    return rigid_inverse(rigid_matrix(cam_from_world.tolist(), where)[0])
+    return pose_by(BUNDLER, np.column_stack([block[1:4], block[4]]), where), at_size_of(lens)
 
 
 def _numbers(lines: Sequence[Sequence[str]], rows: int, columns: int, where: str) -> NDArray[np.float64]:
@@ -141,29 +113,23 @@ def _numbers(lines: Sequence[Sequence[str]], rows: int, columns: int, where: str
 
 
 def _listed_names(root: Path, file: Path, count: int) -> tuple[Path | None, list[str]]:
-    """The file that lists the images, and their names in the order of the cameras; None where there is no such file.
+    """The file that lists the images, if there is one, and their names (else numbers) in the order of the cameras.
 
     Raises:
-        InputError: ``pose_count_mismatch``, ``duplicate_image``, or a code of `listed_name`.
+        InputError: ``pose_count_mismatch``, or a code of `listed_name`.
     """
     undistorted = ".rd." in file.name
     names = sorted(LIST_NAMES, key=lambda name: (".rd." in name) != undistorted)
     places = [folder / name for name in names for folder in (file.parent, root)]
     table = next((path for path in places if path.is_file()), None)
     if table is None:
-        return None, []
+        return None, [str(index) for index in range(count)]
     # `name`, or `name 0 focal_length` as Bundler's own tools write it.
     lines = [_without_focal(line.strip()) for line in read_text(table).splitlines() if line.strip()]
     listed = [listed_name(line, f"{table.name} line {number}") for number, line in enumerate(lines, start=1)]
-    if len(set(listed)) != len(listed):
-        raise InputError("duplicate_image", "names an image twice.", where=table.name, hint="Remove one.")
     if len(listed) != count:
-        raise InputError(
-            "pose_count_mismatch",
-            f"{len(listed)} images for the {count} cameras of {file.name}.",
-            where=table.name,
-            hint="Give list.txt as it was written with the bundle file: one image a line, in its order.",
-        )
+        what = f"{len(listed)} images for the {count} cameras of {file.name}."
+        raise InputError("pose_count_mismatch", what, where=table.name, hint=_LIST_HINT)
     return table, listed
 
 
@@ -174,51 +140,13 @@ def _without_focal(line: str) -> str:
     )
 
 
-def _camera(lens: Lens, where: str, header: ImageHeader, _name: str) -> FrameCamera:
-    focal, k1, k2 = lens
-    centre = (header.width / 2, header.height / 2)
-    model, params = ("RADIAL", (focal, *centre, k1, k2)) if k1 or k2 else ("SIMPLE_PINHOLE", (focal, *centre))
-    return FrameCamera(camera_of_numbers(model, header.width, header.height, params, where))
-
-
-def bundler_problem(camera: Camera) -> str | None:
-    """Why Bundler cannot hold this lens, or None where it can."""
-    if camera.model not in ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"):
-        return f"{camera.model} is another kind of lens"
-    full = camera.full()
-    if full.fx != full.fy:
-        return "it has two focal lengths"
-    if abs(full.cx - camera.width / 2) > _CENTRED_PX or abs(full.cy - camera.height / 2) > _CENTRED_PX:
-        return "its principal point is not in the image's centre"
-    named = {**full._asdict(), "k1": 0.0, "k2": 0.0, "fx": 0.0, "fy": 0.0, "cx": 0.0, "cy": 0.0}
-    if any(named.values()):
-        return "it has more distortion than two radial coefficients"
-    return None
-
-
-def refuse_lenses(
-    cameras: Iterable[Camera], problem_of: Callable[[Camera], str | None], title: str, where: str, hint: str
-) -> None:
-    """Raises InputError ``export_not_possible`` for the first lens with a problem; ``title`` is the format's."""
-    for camera in cameras:
-        problem = problem_of(camera)
-        if problem is not None:
-            raise InputError(
-                "export_not_possible",
-                f"{title} cannot hold a lens of this set: {problem}.",
-                where=where,
-                hint=hint,
-            )
-
-
 def write_bundler(refined: RefinedSet, folder: Path) -> None:
     """Writes ``bundle.out`` and ``list.txt`` (image names in the cameras' order) into ``folder``.
 
     Raises:
         InputError: ``export_not_possible``: a lens that the format cannot hold.
     """
-    hint = "Export `pinhole`: it holds undistorted images, and a bundle.out for them."
-    refuse_lenses(refined.cameras, bundler_problem, "Bundler", "bundler", hint)
+    LENSES.refuse(refined.cameras, "bundler")
     lines = ["# Bundle file v0.3", f"{len(refined)} {len(refined.model.points)}"]
     for index, cam_from_world in enumerate(refined.cam_from_world):
         full = refined.camera_of(index).full()

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.formats.bind_images import in_order
-from biresnerf.data.formats.codec import Codec, WriteContext
+from biresnerf.data.formats.codec import Codec, LensLimits, WriteContext
 from biresnerf.data.formats.parsed_poses import ParsedPoses
-from biresnerf.data.formats.pose_rows import Placed, entry_of
-from biresnerf.data.formats.simple.bundler import bundler_problem, refuse_lenses
+from biresnerf.data.formats.pose_rows import Placed, parsed_rows, pose_by
 from biresnerf.data.model.array_file import HEAD_BYTES, npy_numbers
 from biresnerf.data.model.atomic_file import whole_file
-from biresnerf.data.model.dataset import SourceFormat
-from biresnerf.data.model.pose_validation import rigid_matrix
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.model.untrusted_file import invalid_file, read_bytes
 from biresnerf.errors import InputError
@@ -42,6 +37,14 @@ LLFF = Format(
 # LLFF's own shares of the points in front of a camera that may lie before and behind its bounds, percent.
 _NEAREST, _FARTHEST = 0.1, 99.9
 MAX_IMAGES = 100_000
+_LENSES = LensLimits(
+    "LLFF",
+    (),
+    fisheye=None,
+    two_focal_lengths=False,
+    off_centre=False,
+    hint="Convert to pinhole, which undistorts the photos, then that folder to llff.",
+)
 _COLUMNS = 17
 _HINT = "Write it again with numpy.save, 17 numbers a row."
 
@@ -55,25 +58,15 @@ def parse_llff(_root: Path, file: Path) -> ParsedPoses:
     Raises:
         InputError: codes as in docs/input.md.
     """
-    entries = [
-        entry_of(str(index), where, partial(_read_row, row, where))
-        for index, row in enumerate(_rows(file))
-        for where in [f"{file.name} row {index}"]
-    ]
-    hint = "Leave in images/ just the images that the poses are for; their order by name decides."
-    return ParsedPoses(
-        SourceFormat("llff", files=(file,)),
-        tuple(entries),
-        assign=lambda names: in_order(entries, names, file.name, hint, as_text=True),
-        named=False,
-    )
+    rows = [(str(index), f"{file.name} row {index}", row) for index, row in enumerate(_rows(file))]
+    return parsed_rows(LLFF, [file], rows, _read_row, in_order_of_names="as text")
 
 
 def _read_row(row: NDArray[np.float64], where: str) -> Placed:
     if not np.isfinite(row).all():
         raise InputError("pose_not_finite", "NaN or an infinite number.", where=where, hint=_HINT)
     down, right, back, centre, (height, width, focal) = row[:15].reshape(3, 5).T
-    pose, _ = rigid_matrix(np.stack([right, down, -back, centre], axis=1).tolist(), where)
+    pose = pose_by(LLFF, np.stack([right, down, -back, centre], axis=1), where)
     return pose, _camera(height, width, focal, where)
 
 
@@ -96,14 +89,6 @@ def _rows(file: Path) -> NDArray[np.float64]:
     if rows.ndim != 2 or rows.shape[1] != _COLUMNS or len(rows) > MAX_IMAGES:
         raise invalid_file(file.name, f"holds something other than rows of {_COLUMNS} numbers.", _HINT)
     return rows
-
-
-def llff_problem(camera: Camera) -> str | None:
-    """Why LLFF cannot hold this lens, or None where it can."""
-    problem = bundler_problem(camera)
-    if problem is None and any(camera.full()[4:]):
-        return "it is distorted"
-    return problem
 
 
 def rows_by_name(refined: RefinedSet) -> list[int]:
@@ -132,8 +117,7 @@ def write_llff(refined: RefinedSet, path: Path, bounds: NDArray[np.float64] | No
     Raises:
         InputError: ``export_not_possible``: a lens that the format cannot hold; ``bounds_missing``: no points are seen.
     """
-    hint = "Convert to pinhole, which undistorts the photos, then that folder to llff."
-    refuse_lenses(refined.cameras, llff_problem, "LLFF", "llff", hint)
+    _LENSES.refuse(refined.cameras, "llff")
     if bounds is None:
         bounds = np.array([_bounds_of_points(refined, index) for index in range(len(refined))])
     write_poses_bounds(refined, bounds, path)

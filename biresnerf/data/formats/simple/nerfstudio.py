@@ -9,18 +9,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from biresnerf.data.formats.codec import Codec, WriteContext
+from biresnerf.data.formats.codec import Codec, LensLimits, WriteContext
 from biresnerf.data.formats.simple.points_ply import POINTS_PLY, write_points_ply
 from biresnerf.data.formats.transforms.read_transforms import (
     bind_transforms,
     parse_transforms,
     refuse_frames_without_files,
 )
-from biresnerf.data.formats.transforms.write_intrinsics import lens_values
+from biresnerf.data.formats.transforms.write_intrinsics import lens_values, listed_frames
 from biresnerf.data.model.atomic_file import write_json
-from biresnerf.data.model.conventions import file_from_world_from_cam
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.errors import InputError
@@ -49,9 +46,9 @@ NERFSTUDIO = Format(
 # What the parser reads; all of them, or none, at the top.
 _RADIAL = ("k1", "k2", "k3", "k4")
 _BROWN = (*_RADIAL, "p1", "p2")
-_BEYOND = ("k4", "k5", "k6")  # the rational model's, of which nerfstudio knows nothing
-# The thin prism's, and of the carriers of other lenses.
-_BEYOND_FISHEYE = ("p1", "p2", "sx1", "sy1", "b1", "b2", "b3")
+_LENSES = LensLimits(
+    "nerfstudio"
+)  # k4 of another lens than a fisheye is the rational model's, which it does not know
 
 
 def write_nerfstudio(refined: RefinedSet, path: Path, dataset: Dataset | None = None) -> None:
@@ -63,34 +60,22 @@ def write_nerfstudio(refined: RefinedSet, path: Path, dataset: Dataset | None = 
     Raises:
         InputError: ``export_not_possible``: a lens that nerfstudio does not have.
     """
-    lenses = [_lens(camera) for camera in refined.cameras]
+    _LENSES.refuse(refined.cameras, NERFSTUDIO.in_result)
     kinds = {camera.full().fisheye for camera in refined.cameras}
     if len(kinds) > 1:
-        raise _impossible("it takes all lenses of a set for fisheyes, or none")
-    document: dict[str, Any] = {"camera_model": "OPENCV_FISHEYE" if kinds == {True} else "OPENCV"}
-    shared = lenses[0] if len(lenses) == 1 else {}
-    document |= shared
+        what = "nerfstudio takes all lenses of a set for fisheyes, or none."
+        raise InputError("export_not_possible", what, where=NERFSTUDIO.in_result, hint=_LENSES.hint)
+    masks = [{"mask_path": name} for name in _masks(dataset)]
+    shared, frames = listed_frames(refined, [_lens(camera) for camera in refined.cameras], masks)
+    document: dict[str, Any] = {"camera_model": "OPENCV_FISHEYE" if kinds == {True} else "OPENCV", **shared}
     if len(refined.model.points):
         write_points_ply(refined, path.with_name(POINTS_PLY.in_set))
         document["ply_file_path"] = POINTS_PLY.in_set
-    matrices = file_from_world_from_cam(refined.world_from_cam, np.eye(4), 1.0)
-    masks = _masks(dataset)
-    document["frames"] = [
-        {
-            "file_path": image.file_name,
-            **({} if shared else lenses[image.camera]),
-            **({"mask_path": masks[index]} if masks else {}),
-            "transform_matrix": matrix.tolist(),
-        }
-        for index, (image, matrix) in enumerate(zip(refined.images, matrices, strict=True))
-    ]
-    write_json(path, document)
+    write_json(path, {**document, "frames": frames})
 
 
 def _lens(camera: Camera) -> dict[str, Any]:
     full = camera.full()
-    if any(getattr(full, name) for name in (_BEYOND_FISHEYE if full.fisheye else _BEYOND)):
-        raise _impossible(f"it has no lens with all coefficients of {camera.model}")
     values = {key: value for key, value in lens_values(camera).items() if key not in COEFFICIENTS}
     coefficients = _RADIAL if full.fisheye else _BROWN if full.distorted else ()
     return values | {name: getattr(full, name) for name in coefficients}
@@ -106,15 +91,6 @@ def _masks(dataset: Dataset | None) -> list[str]:
             return []
         names.append(frame.mask.relative_to(dataset.root).as_posix())
     return names
-
-
-def _impossible(why: str) -> InputError:
-    return InputError(
-        "export_not_possible",
-        f"nerfstudio cannot read this set: {why}.",
-        where=NERFSTUDIO.in_result,
-        hint="Export `pinhole`, which holds undistorted images and such a file for them.",
-    )
 
 
 def _write(refined: RefinedSet, path: Path, context: WriteContext) -> None:

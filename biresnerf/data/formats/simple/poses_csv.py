@@ -7,21 +7,17 @@ from __future__ import annotations
 
 import csv
 import io
-import re
-from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
-from biresnerf.data.formats.codec import Codec
-from biresnerf.data.formats.colmap.model_checks import image_name, rigid_pose
+from biresnerf.data.formats.codec import Codec, head_of
+from biresnerf.data.formats.colmap.model_checks import image_name
 from biresnerf.data.formats.parsed_poses import ParsedPoses
-from biresnerf.data.formats.pose_rows import Placed, Row, parsed_rows
+from biresnerf.data.formats.pose_rows import Placed, parsed_rows, pose_of_numbers
 from biresnerf.data.formats.simple.camera_file import read_camera_file
 from biresnerf.data.model.atomic_file import write_text
-from biresnerf.data.model.colmap_scene import matrix_of_pose
 from biresnerf.data.model.conventions import quat_wxyz_from_rotation
 from biresnerf.data.model.refined_set import RefinedSet
-from biresnerf.data.model.untrusted_file import finite_numbers, invalid_file, read_text
+from biresnerf.data.model.untrusted_file import Table, invalid_file, read_table, read_text
 from biresnerf.options.formats import Format
 
 POSES_CSV = Format(
@@ -46,12 +42,16 @@ COLUMNS = (
     "pose_source", "flags",
 )  # fmt: skip
 
-_NAMES = "(image|img|photo|file|frame)?(name|path|file)|image|img|photo"
-_AXES = "(t|p|c|pos|position|translation|cent(er|re)|camera)?{}"
-_PARTS = "(q|quat|quaternion|rot|rotation|orientation){}"
-_VALUES = tuple(_AXES.format(axis) for axis in "xyz") + tuple(_PARTS.format(part) for part in "wxyz")
+_VALUES = ("x", "y", "z", "w", "i", "j", "k")
+_TITLES = {
+    "name": ("(image|img|photo|file|frame)?(name|path|file)|image|img|photo",),
+    **{axis: (f"(t|p|c|pos|position|translation|cent(er|re)|camera)?{axis}",) for axis in "xyz"},
+    **{
+        part: (f"(q|quat|quaternion|rot|rotation|orientation){axis}",)
+        for part, axis in zip("wijk", "wxyz", strict=True)
+    },
+}
 _HINT = "Give columns image, x, y, z, qw, qx, qy, qz: camera to world, OpenCV axes."
-_HEAD_BYTES = 4096
 
 
 def parse_poses_csv(root: Path, file: Path) -> ParsedPoses:
@@ -60,49 +60,22 @@ def parse_poses_csv(root: Path, file: Path) -> ParsedPoses:
     Raises:
         InputError: codes as in docs/input.md.
     """
-    lines = read_text(file).splitlines()
-    columns = _columns(lines[0] if lines else "")
-    if columns is None:
+    table = _table(file, read_text(file))
+    if table is None:
         raise invalid_file(file.name, "has no head that names an image, a position and a quaternion.", _HINT)
     lens, _, camera_files = read_camera_file(root)
 
-    def read(words: Sequence[str], where: str) -> Placed:
-        if len(words) <= max(columns):
-            raise invalid_file(where, f"has {len(words)} values, fewer than columns.", _HINT)
-        x, y, z, *quat = finite_numbers([words[at] for at in columns[1:]], where, _HINT).tolist()
-        turned = rigid_pose([*quat, x, y, z], where, _HINT)
-        return matrix_of_pose(turned), lens
+    def read(row: list[str], where: str) -> Placed:
+        numbers = table.numbers(row, _VALUES, where, _HINT)
+        return pose_of_numbers(POSES_CSV, numbers[3:], numbers[:3], where, _HINT), lens
 
-    rows: list[Row] = []
-    for number, words in enumerate(csv.reader(lines[1:], delimiter=_delimiter(lines[0])), start=2):
-        if any(words):
-            where = f"{file.name} line {number}"
-            name = words[columns[0]].strip() if columns[0] < len(words) else ""
-            rows.append((image_name(name, where), where, partial(read, words, where)))
+    rows = [(image_name(table.cell(row, "name"), where), where, row) for where, row in table.rows if any(row)]
     note = f"{file.name} was read as camera to world with OpenCV axes"
-    return parsed_rows("csv", [file, *camera_files], rows, notes=(note,))
+    return parsed_rows(POSES_CSV, [file, *camera_files], rows, read, notes=(note,))
 
 
-def _delimiter(head: str) -> str:
-    return max(",;\t", key=head.count)
-
-
-def _columns(head: str) -> list[int] | None:
-    """Where the head has the image's name, x, y, z, and the quaternion from w on; None where it lacks one."""
-    names = [re.sub(r"[^a-z]", "", name.lower()) for name in head.split(_delimiter(head))]
-    found = [
-        next((at for at, name in enumerate(names) if re.fullmatch(pattern, name)), None)
-        for pattern in (_NAMES, *_VALUES)
-    ]
-    known = [at for at in found if at is not None]
-    return known if len(known) == len(found) else None
-
-
-def _recognises(file: Path) -> bool:
-    if not file.is_file():
-        return False
-    with file.open("rb") as opened:
-        return _columns(opened.readline(_HEAD_BYTES).decode("utf-8-sig", "replace")) is not None
+def _table(file: Path, text: str) -> Table | None:
+    return read_table(file.name, text.splitlines(), _TITLES, lambda found: len(found) == len(_TITLES))
 
 
 def write_poses_csv(refined: RefinedSet, path: Path) -> None:
@@ -127,7 +100,7 @@ CODECS = (
     Codec(
         POSES_CSV,
         parse=parse_poses_csv,
-        recognises=_recognises,
+        recognises=lambda file: _table(file, head_of(file).decode("utf-8-sig", "replace")) is not None,
         write=lambda refined, path, _: write_poses_csv(refined, path),
     ),
 )

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from biresnerf.data.formats.codec import Codec
+from biresnerf.data.formats.codec import Codec, head_of
 from biresnerf.data.formats.match_names import match_files
 from biresnerf.data.formats.parsed_poses import Assignment, ParsedPoses, PoseEntry
 from biresnerf.data.formats.simple.camera_file import read_camera_file
@@ -180,8 +180,7 @@ def _is_trajectory(file: Path) -> bool:
     sequence = file.stem.isdecimal()  # KITTI's are called by numbers
     if not file.is_file() or not (sequence or file.stem == "pose"):
         return file.is_file()
-    with file.open("rb") as opened:
-        words = opened.readline(4096).split()
+    words = head_of(file).partition(b"\n")[0].split()
     lengths = (12,) if sequence else (7, 8, 12)
     return len(words) in lengths and all(number_of(word.decode("latin-1")) is not None for word in words)
 

@@ -11,15 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from biresnerf.data.formats.codec import Codec
+from biresnerf.data.formats.codec import Codec, LensLimits
 from biresnerf.data.formats.transforms.read_transforms import (
     bind_transforms,
     parse_transforms,
     refuse_frames_without_files,
 )
-from biresnerf.data.formats.transforms.write_intrinsics import lens_values, ngp_coefficients
+from biresnerf.data.formats.transforms.write_intrinsics import lens_values, listed_frames, ngp_coefficients
 from biresnerf.data.model.atomic_file import write_json
-from biresnerf.data.model.conventions import file_from_world_from_cam
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import COEFFICIENTS, Camera
@@ -46,6 +45,7 @@ INSTANT_NGP = Format(
 LARGEST_AABB = 128  # the loader's bound; powers of two only
 INNER_SHARE = 0.9  # of the unit cube, for what the cameras look at
 POINTS_INSIDE = 0.98  # of the points that the box must hold
+_LENSES = LensLimits("instant-ngp", ("k1", "k2", "p1", "p2"))
 # What its image reader decodes, of what we read.
 _SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp"})
 
@@ -58,28 +58,18 @@ def write_transforms_ngp(refined: RefinedSet, path: Path) -> None:
     """
     for image in refined.images:
         if PurePosixPath(image.file_name).suffix.lower() not in _SUFFIXES:
-            raise _impossible(f"it cannot decode {image.file_name}")
-    lenses = [_lens(camera) for camera in refined.cameras]
-    shared = lenses[0] if len(refined.cameras) == 1 else {}
+            what = f"instant-ngp cannot decode {image.file_name}."
+            raise InputError("export_not_possible", what, where=INSTANT_NGP.in_result, hint=_LENSES.hint)
+    _LENSES.refuse(refined.cameras, INSTANT_NGP.in_result)
+    shared, frames = listed_frames(refined, [_lens(camera) for camera in refined.cameras])
     scale, offset, aabb_scale = _placement(refined)
-    document: dict[str, Any] = {**shared, "scale": scale, "offset": offset, "aabb_scale": aabb_scale}
-    matrices = file_from_world_from_cam(refined.world_from_cam, np.eye(4), 1.0)
-    document["frames"] = [
-        {
-            "file_path": image.file_name,
-            **({} if shared else lenses[image.camera]),
-            "transform_matrix": matrix.tolist(),
-        }
-        for image, matrix in zip(refined.images, matrices, strict=True)
-    ]
-    write_json(path, document)
+    placed = {"scale": scale, "offset": offset, "aabb_scale": aabb_scale}
+    write_json(path, {**shared, **placed, "frames": frames})
 
 
 def _lens(camera: Camera) -> dict[str, Any]:
     full = camera.full()
-    lacking = [name for name in COEFFICIENTS if name not in ngp_coefficients(full)]
-    if any(getattr(full, name) for name in lacking):
-        raise _impossible(f"it has no lens with all coefficients of {camera.model}")
+    lacking = {*COEFFICIENTS} - {*ngp_coefficients(full)}
     values = {key: value for key, value in lens_values(camera).items() if key not in lacking}
     return {**values, "is_fisheye": True} if full.fisheye else values
 
@@ -100,15 +90,6 @@ def _placement(refined: RefinedSet) -> tuple[float, list[float], int]:
     while aabb_scale < LARGEST_AABB and 0.5 * aabb_scale < scale * max(reach):
         aabb_scale *= 2
     return scale, (0.5 - scale * focus.point).tolist(), aabb_scale
-
-
-def _impossible(why: str) -> InputError:
-    return InputError(
-        "export_not_possible",
-        f"instant-ngp cannot read this set: {why}.",
-        where=INSTANT_NGP.in_result,
-        hint="Export `pinhole`, which holds undistorted images, and use its model.",
-    )
 
 
 CODECS = (

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
+from biresnerf.data.model.conventions import file_from_world_from_cam
+from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.geometry.camera.camera_models import COEFFICIENTS, MODEL_PARAMETERS, Camera, FullParameters
 from biresnerf.geometry.camera.carried_lenses import SHAPES
 
@@ -38,6 +43,23 @@ def lens_values(camera: Camera) -> dict[str, Any]:
 def ngp_coefficients(lens: FullParameters) -> tuple[str, ...]:
     """The coefficients that instant-ngp knows. It would take p1 and p2 of a fisheye for its k3 and k4."""
     return ("k1", "k2", "k3", "k4") if lens.fisheye else ("k1", "k2", "p1", "p2")
+
+
+def listed_frames(
+    refined: RefinedSet, lenses: Sequence[dict[str, Any]], more: Sequence[dict[str, Any]] | None = None
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """What a file in the set's own world says of all frames, the one lens, and of each; ``more`` stands in each."""
+    shared = lenses[0] if len(lenses) == 1 else {}
+    matrices = file_from_world_from_cam(refined.world_from_cam, np.eye(4), 1.0)
+    return shared, [
+        {
+            "file_path": image.file_name,
+            **({} if shared else lenses[image.camera]),
+            **(more[index] if more else {}),
+            "transform_matrix": matrix.tolist(),
+        }
+        for index, (image, matrix) in enumerate(zip(refined.images, matrices, strict=True))
+    ]
 
 
 def has_own_intrinsics(place: dict[str, Any]) -> bool:
