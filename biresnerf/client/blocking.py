@@ -108,6 +108,7 @@ class Client:
     download_all = _blocking(AsyncClient.download_all)
     result = _blocking(AsyncClient.result)
     report = _blocking(AsyncClient.report)
+    compare = _blocking(AsyncClient.compare)
     images = _blocking(AsyncClient.images)
     share = _blocking(AsyncClient.share)
     export = _blocking(AsyncClient.export)

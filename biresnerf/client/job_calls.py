@@ -10,6 +10,7 @@ from datetime import datetime
 from typing import Any, TypeAlias, Unpack
 
 from biresnerf.client.transport import Call, Transport, parse
+from biresnerf.comparison.conclusion import Comparison
 from biresnerf.options.formats import ExportName, PosesOf
 from biresnerf.options.refine_options import RefineOptions, parse_options
 from biresnerf.report import Report
@@ -152,6 +153,11 @@ class JobCalls(Transport):
     async def report(self, job_id: str) -> Report:
         """The report of a finished job: verdict, evidence, images, cameras."""
         return parse(await self._ask(Call("GET", f"{job_url(job_id)}/report")), Report)
+
+    async def compare(self, job_id: str, other_id: str) -> Comparison:
+        """Which of two jobs' results is better and by what, the first one's or the other's; or why nobody can know."""
+        answer = await self._ask(Call("GET", f"{job_url(job_id)}/comparison/{other_id}"))
+        return parse(answer, Comparison)
 
     async def images(self, job_id: str, *, sort: str = "", limit: int | None = None) -> ImageList:
         """The report's figures of each image, sorted by a column (largest first with ``-`` before its name)."""

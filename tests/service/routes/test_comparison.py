@@ -7,6 +7,7 @@ from typing import Any
 
 import httpx
 
+from biresnerf.client import Client
 from biresnerf.comparison.compare_results import compare_results
 from biresnerf.comparison.conclusion import Comparison
 from biresnerf.data.formats.simple.poses_json import PosesDocument
@@ -33,6 +34,8 @@ def test_two_jobs_are_compared_as_their_files_are(
     said = Comparison.model_validate(compared(http, done_job["id"], far["id"]).json())
     assert said == compare_results(files(http, done_job["id"]), files(http, far["id"]))
     assert (said.contradict, said.photos) == (True, 3)
+    with Client(str(http.base_url)) as client:
+        assert client.compare(done_job["id"], far["id"]) == said
     same = compared(http, done_job["id"], done_job["id"]).json()
     assert (same["outcome"], same["conclusion"]) == ("same", "Both results hold the same poses.")
 
