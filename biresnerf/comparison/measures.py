@@ -10,14 +10,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from biresnerf.comparison.conclusion import ComparedFigure, Side
-from biresnerf.comparison.paired import EPIPOLAR_MATTERS, FITS_BELOW, PSNR_MATTERS, paired
 from biresnerf.data.formats.simple.poses_json import PosesDocument
+from biresnerf.judging.compare import FITS_BELOW, MATCH_ERRORS, UNSEEN_PSNR, Array, compare, octaves
 from biresnerf.report import Finding, ImageReport, Report, Verdict
-
-Array = NDArray[np.float64]
 
 FEWEST = 3  # photos that a measure needs in both results
 SIMILAR_MATCHES = 2.0  # sets of feature matches that differ by more than this factor are no common measure
@@ -96,8 +93,7 @@ def _matches(first: Result, second: Result, pairs: _Pairs) -> ComparedFigure | N
     sizes = [side.long_sides() for side in (first, second)]
     if any(sizes[0].get(name) != sizes[1].get(name) for name in names):
         return _without(MATCHES, texts, "the photos differ in size")
-    gains = np.log2(np.maximum(values[1], LEAST_PX) / np.maximum(values[0], LEAST_PX))
-    side = _SIDES[paired(values[1], values[0], EPIPOLAR_MATTERS, gains).finding]
+    side = _SIDES[compare(octaves(values[1], values[0], LEAST_PX), MATCH_ERRORS).finding]
     note = ""
     if side in ("first", "second"):
         index = 0 if side == "first" else 1
@@ -116,23 +112,19 @@ def _matches(first: Result, second: Result, pairs: _Pairs) -> ComparedFigure | N
 def _views(first: Result, second: Result, pairs: _Pairs) -> ComparedFigure | None:
     trials = [side.verdict.heldout if side.verdict else None for side in (first, second)]
     names, values = _both_known(pairs, _trial_psnr(first), _trial_psnr(second))
-    if trials[0] is None or trials[1] is None:
-        texts = [
-            NONE if trial is None else f"{trial.psnr.before if side.kept_input else trial.psnr.after:.2f} dB"
-            for side, trial in zip((first, second), trials, strict=True)
-        ]
-        return _without(VIEWS, texts, "only one result was tested on them")
     texts = [
-        f"{trial.psnr.before if side.kept_input else trial.psnr.after:.2f} dB"
-        for side, trial in zip((first, second), (trials[0], trials[1]), strict=True)
+        NONE if trial is None else f"{trial.psnr.before if side.kept_input else trial.psnr.after:.2f} dB"
+        for side, trial in zip((first, second), trials, strict=True)
     ]
+    if trials[0] is None or trials[1] is None:
+        return _without(VIEWS, texts, "only one result was tested on them")
     if trials[0].steps != trials[1].steps:
         return _without(VIEWS, texts, f"the tests trained for {trials[0].steps} and {trials[1].steps} steps")
     if first.report.working_size != second.report.working_size:
         return _without(VIEWS, texts, "the tests used photos of different sizes")
     if len(names) < FEWEST:
         return _without(VIEWS, texts, f"the tests have {len(names)} views in common")
-    side = _SIDES[paired(values[1], values[0], PSNR_MATTERS).finding]
+    side = _SIDES[compare(values[0] - values[1], UNSEEN_PSNR).finding]
     texts = [f"{float(each.mean()):.2f} dB" for each in values]
     return ComparedFigure(name=VIEWS, first=texts[0], second=texts[1], better=side)
 

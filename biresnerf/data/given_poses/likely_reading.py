@@ -11,16 +11,13 @@ from biresnerf.data.given_poses.constant_turn import best_turn
 from biresnerf.data.given_poses.matched_details import MatchedPair, matched_pairs, off_by
 from biresnerf.data.given_poses.readings import format_of, poses_read_as
 from biresnerf.data.model.dataset import Dataset
+from biresnerf.judging.compare import BEHIND, READING, is_better
 from biresnerf.options.formats import Format
 from biresnerf.options.given_poses import PoseQuestion, PoseReading, in_words
 
 Reading = tuple[PoseReading, ...]
 SHIFTS = 7  # details matched wrongly on purpose show how many agree by chance
-# A question is asked where another reading explains so much more of what photos have in common (a share of it), by so
-# many standard errors, over so many pairs. On 15 real sets with noise of 0 to 0.3, two seeds each, no wrong reading was
-# more than 2.1 standard errors better than the right one.
-MORE, CLEARLY, LEAST_PAIRS = 0.1, 4.0, 4
-AS_GOOD = 1.0  # standard errors behind the best reading; of all that are no more, the commonest mistake is asked about
+LEAST_PAIRS = 4  # of photos
 
 
 def pose_question(dataset: Dataset) -> PoseQuestion | None:
@@ -49,15 +46,14 @@ def borne_out(dataset: Dataset, pairs: Sequence[MatchedPair]) -> PoseQuestion | 
     as_given = agreeing(given)
     others = {one: agreeing(poses_read_as(given, dataset.source, one)) for one in _readings(form)}
     best = max(others.values(), key=lambda found: float(found.mean()))
-    clearly = best.mean() - as_given.mean() >= MORE and _ahead(best, as_given) >= CLEARLY
-    if not clearly:
+    if not is_better(best - as_given, READING):
         return None
     turn = np.eye(4)
     turn[:3, :3] = best_turn(dict(zip(rows, given, strict=True)), pairs)
     of_body = agreeing(given @ turn)
-    if of_body.mean() - best.mean() >= MORE and _ahead(of_body, best) >= CLEARLY:
+    if is_better(of_body - best, READING):
         return None  # poses of what carries the camera, as the run will find
-    reading = next(one for one, found in others.items() if _ahead(best, found) <= AS_GOOD)
+    reading = next(one for one, found in others.items() if not is_better(best - found, BEHIND))
     shares = float(as_given.mean()), float(others[reading].mean())
     return PoseQuestion(given_poses=reading, question=_asked(reading, shares), agreeing=shares)
 
@@ -69,13 +65,6 @@ def _readings(form: Format) -> Iterator[Reading]:
     if form.quaternion:
         yield ("wxyz" if form.quaternion == "xyzw" else "xyzw",)
     yield from (("left_handed",), ("rolled_90",), ("rolled_180",), ("rolled_270",))
-
-
-def _ahead(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    """By how many standard errors the mean of ``a`` [n] is above that of ``b`` [n], pair by pair."""
-    difference = a - b
-    error = float(difference.std(ddof=1)) / np.sqrt(len(difference))
-    return float(difference.mean() / max(error, 1e-9))
 
 
 def _agreeing(first: NDArray[np.float64], second: NDArray[np.float64], pair: MatchedPair) -> float:

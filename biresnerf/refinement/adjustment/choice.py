@@ -9,16 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.comparison.paired import student_quantile
+from biresnerf.judging.compare import LEFT_OUT, compare, octaves
 from biresnerf.refinement.adjustment.lens.lenses import Lenses
-from biresnerf.report import CandidateName, CandidateReport
+from biresnerf.report import CandidateName, CandidateReport, Finding
 
 logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
-# Cameras that a kind of evidence must know with both sets of poses, else it says nothing of them.
-LEAST_JUDGED = 3
 _LEAST = 1e-6  # of a misfit, in squared noise levels: nothing fits better than that
 
 
@@ -86,32 +84,18 @@ def _beats(
     misfits: Mapping[str, Array], alike: Mapping[str, NDArray[np.bool_]], one: int, other: int
 ) -> bool:
     """Whether a candidate fits some kind of evidence better than another one, and none worse."""
-    signs = [
-        0 if kind in alike and alike[kind][[one, other]].all() else _sign(_gains(misfit, one, other))
+    found = [
+        judged(misfit[other], misfit[one])
         for kind, misfit in misfits.items()
+        if kind not in alike or not alike[kind][[one, other]].all()
     ]
-    return 1 in signs and -1 not in signs
+    return "better" in found and "worse" not in found
 
 
-def fits_better(one: Array, other: Array) -> bool:
-    """Whether misfits [n] are less than others beyond chance."""
-    return _sign(_gains(np.stack([one, other]), 0, 1)) > 0
-
-
-def _gains(misfit: Array, one: int, other: int) -> Array:
-    """log2 of how much less a candidate's errors are than another's, of each camera that is known with both."""
-    known = np.isfinite(misfit[one]) & np.isfinite(misfit[other])
-    ours, theirs = (np.maximum(misfit[i][known], _LEAST) for i in (one, other))
-    return np.asarray(np.log2(theirs / ours) / 2)
-
-
-def _sign(gains: Array) -> int:
-    """1 where they are positive beyond chance, -1 where they are negative: Student's interval at 95 %."""
-    if len(gains) < LEAST_JUDGED:
-        return 0
-    half = student_quantile(len(gains) - 1) * float(gains.std(ddof=1)) / len(gains) ** 0.5
-    mean = float(gains.mean())
-    return int(mean > half) - int(mean < -half)
+def judged(before: Array, after: Array) -> Finding:
+    """What misfits [n] of one set of poses and another say of the latter, by the cameras that are known with both."""
+    known = np.isfinite(before) & np.isfinite(after)
+    return compare(octaves(before[known], after[known], _LEAST) / 2, LEFT_OUT).finding
 
 
 def _median(misfit: Array | None, candidate: int) -> float | None:

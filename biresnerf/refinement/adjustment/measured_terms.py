@@ -12,6 +12,7 @@ from biresnerf.geometry.body_offset import SHARED_ERRORS
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.earth.georeference import NORMAL_MEDIAN
 from biresnerf.geometry.similarity import Similarity, align_points
+from biresnerf.judging.compare import MEASURED, compare
 from biresnerf.refinement.adjustment.cameras import POSE, Cameras
 from biresnerf.refinement.adjustment.evidence import Control, Evidence, Positions
 from biresnerf.refinement.adjustment.solver.term import Linearised
@@ -23,7 +24,6 @@ FINEST_M = 1e-3  # no position is as exact
 MARKED_PX = 0.5  # nobody marks a point in a photo more exactly
 SETTLING = 3  # measurements of a noise level for cameras that stay
 DIMENSIONS = {"positions": 3, "control": 2}  # of a residual
-CLEAR = 3.0  # standard deviations of a noise level, beyond which two differ
 
 
 class PositionTerm:
@@ -161,7 +161,8 @@ def measured_misfits(rigs: Sequence[tuple[Cameras, Evidence]]) -> dict[str, tupl
                 each[kind].measure(cameras)
         noise = np.array([each[kind].noise for each, _ in terms])
         square = np.stack([each[kind].squares(cameras, float(noise.min())) for each, cameras in terms])
-        chance = 1 + CLEAR / (2 * DIMENSIONS[kind] * square.shape[1]) ** 0.5
+        behind = (1 - noise / noise.min()) * (2 * DIMENSIONS[kind] * square.shape[1]) ** 0.5
         robust = 1 / (1 / ROBUST_SCALE**2 + 1 / np.clip(square, 1e-300, 1e300))
-        found[kind] = robust, noise < chance * noise.min()
+        as_well = [compare(float(gain), MEASURED).finding == "same" for gain in behind]
+        found[kind] = robust, np.array(as_well)
     return found

@@ -13,7 +13,7 @@ from biresnerf.geometry.camera.camera_models import REFINED_PARAMETERS, Camera
 from biresnerf.geometry.camera.lens import lens_problem
 from biresnerf.options.refine_options import RefineIntrinsics
 from biresnerf.refinement.adjustment.adjustment import Adjustment, adjust_poses, misfit
-from biresnerf.refinement.adjustment.choice import fits_better
+from biresnerf.refinement.adjustment.choice import judged
 from biresnerf.refinement.adjustment.evidence import Evidence, NoiseLevels, PosePrior
 from biresnerf.refinement.adjustment.lens.corrected_camera import corner, corrected_camera
 from biresnerf.refinement.adjustment.lens.lenses import (
@@ -136,15 +136,15 @@ def contradicted_focals(
     if freed.lenses is None:
         return said
     with_lens = replace(left_out, lenses=kept.known(freed.lenses.correction))
-    better = fits_better(
-        misfit(freed.world_from_cam, with_lens, noise), misfit(held.world_from_cam, left_out, noise)
+    found = judged(
+        misfit(held.world_from_cam, left_out, noise), misfit(freed.world_from_cam, with_lens, noise)
     )
     for i in np.flatnonzero(kept.free[:, 0]).tolist():
         off, deviation = freed.lenses.correction[i, 0], freed.lenses.deviation[i, 0]
         observable = bool(freed.lenses.observable[i, 0])
         clear = (
             observable
-            and better
+            and found == "better"
             and abs(off) > FOCAL_CONTRADICTED * np.hypot(kept.deviation[i, 0], deviation)
         )
         said[i] = FocalCertainty(_known(deviation), observable, float(np.exp(off)) if clear else None)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.geometry.camera.camera_models import REFINED_PARAMETERS, Camera
+from biresnerf.judging.compare import FREER_LENS, is_better
 from biresnerf.refinement.adjustment.adjustment import Adjustment, adjust_poses, track_term
 from biresnerf.refinement.adjustment.cameras import POSE, Cameras
 from biresnerf.refinement.adjustment.evidence import Evidence, PosePrior
@@ -23,7 +24,6 @@ logger = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 MOST_OBSERVATIONS = 20_000  # more tell the same
-CLEAR = 2.0  # standard errors by which tracks that were left out must fit better
 
 
 def supported_lenses(
@@ -99,10 +99,7 @@ def _told(best: Adjustment, fitted: Evidence, prior: PosePrior, kept: Lenses) ->
 def _pays(found: Adjustment, best: Adjustment, left_out: Evidence) -> bool:
     """Whether points that were left out fit better, beyond chance."""
     ours, theirs = (_misfits(each, left_out, found.track_noise_px) for each in (found, best))
-    if ours is None or theirs is None:
-        return False
-    gains = theirs - ours
-    return bool(gains.mean() > CLEAR * gains.std(ddof=1) / len(gains) ** 0.5)
+    return ours is not None and theirs is not None and is_better(theirs - ours, FREER_LENS)
 
 
 def _misfits(found: Adjustment, left_out: Evidence, noise_px: float) -> Array | None:

@@ -17,6 +17,7 @@ from torch import Tensor
 from biresnerf.field.radiance_field import Marching, PositionGradient, Rays, Rendering
 from biresnerf.frozen_model import FrozenModel
 from biresnerf.geometry.pose_error import rotation_between_deg
+from biresnerf.judging.compare import ANY_GAIN, FAR_REPAIRED, REPAIRED, is_better, octaves
 from biresnerf.refinement.lost.own_matches import OwnMatches, better, contradicted
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.pose_hypotheses import pose_hypotheses
@@ -33,9 +34,8 @@ ROUNDS = ((6, 48, 40), (2, 128, 50))  # poses kept, rays a step of each, steps
 RATES = (1e-2, 1e-3)  # pose learning rate of the first and the last step
 DISTINCT_DEG = 8.0  # poses nearer than this to a better one are not tried beside it
 LEAST_INTERVAL = 1.2e-2  # unit lengths: scoring needs no finer samples
-# A pose is accepted below these shares of the old error, and of the others' median; or below the third one of the old
-# error alone (docs/studies.md).
-BETTER, NEAR_MEDIAN, FAR_BETTER = 0.7, 1.5, 0.25
+NEAR_MEDIAN = 1.5  # times the others' median error, below which a camera is one of them
+NO_ERROR = 1e-12
 ALONE = 0.2  # sharing less of its view than this, a camera of an open scene must go elsewhere, however small its error
 ALONE_SIDE = 8  # as seen by 8 x 8 pixels
 ALONE_MOST = 0.2  # of all cameras: where more are alone, the photos were taken so
@@ -203,10 +203,8 @@ class LostCameraRepair:
         scores = self._scores(tried, image)
         old = float(scores[0])
         # A guess need not be clearly beaten.
-        better = 1.0 if bool(optimiser.camera_errors.doubted[camera]) else BETTER
-        bound = min(better * old, max(NEAR_MEDIAN * median, FAR_BETTER * old))
+        rule = ANY_GAIN if bool(optimiser.camera_errors.doubted[camera]) else REPAIRED
         if alone:  # its own error says nothing, nor does that of another pose that shares no view
-            bound = NEAR_MEDIAN * median
             shared = self._shared(tried, image) >= ALONE
             if not bool(shared.any()):
                 return
@@ -217,7 +215,11 @@ class LostCameraRepair:
             scores = self._scores(tried, image[: len(tried)])
             best = int(scores.argmin())
             error = float(scores[best])
-            accepted = error < bound and not self._matches.object_to(camera, tried[best])
+            gain = octaves(old, error, NO_ERROR)
+            accepted = near = error < NEAR_MEDIAN * median
+            if not alone:
+                accepted = is_better(gain, rule) and (near or is_better(gain, FAR_REPAIRED))
+            accepted = accepted and not self._matches.object_to(camera, tried[best])
             if accepted and (optimiser.switch is None or error < median):
                 break  # the run itself optimises the rest
         logger.info(

@@ -13,6 +13,7 @@ from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.epipolar import epipolar_angles
 from biresnerf.geometry.resection import resect
 from biresnerf.geometry.triangulation import parallax_deg, triangulate
+from biresnerf.judging.compare import ANY_GAIN, is_better, octaves
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.scene.scene_depth import track_rays
 
@@ -114,7 +115,7 @@ def contradicted(errors_px: Array) -> NDArray[np.bool_]:
 
 def better(camera: int, before_px: Array, after_px: Array) -> bool:
     """Whether a camera's own matches fit better after than before, by its errors [n]."""
-    return bool(max(after_px[camera], LEAST_PX) < max(before_px[camera], LEAST_PX))
+    return is_better(octaves(before_px[camera], after_px[camera], LEAST_PX), ANY_GAIN)
 
 
 def _usual(errors_px: Array) -> float:

@@ -17,6 +17,7 @@ from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.data.workload import LOOKS, TRIAL_STEPS
+from biresnerf.judging.compare import CLEAR_TRIAL, TRIAL, is_better
 from biresnerf.progress import Monitor, Progress
 from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.start.forward_facing import find_forward_facing
@@ -27,10 +28,6 @@ from biresnerf.report import TrialReport
 
 logger = logging.getLogger(__name__)
 
-MARGIN_DB = 0.3  # less is a tie
-# A set of poses that is right is better by more than this: 2.4 to 8 dB over noisy ones on ten sets, 1.6 on kitchen25.
-# One that is consistent but wrong is not: 0.2 and 1.2 dB on coffee, a symmetric thing.
-CLEAR_DB = 2.0
 # Right poses explain so many of the matches that no mapping was shown, wrong ones fewer: 0.95 to 0.98 on five sets,
 # and 0.56 to 0.59 for coffee's wrong models (docs/input.md).
 EXPLAINS = 0.9
@@ -110,7 +107,7 @@ def choose_start(
             break
     did(work)
     best = int(np.argmax(scores))
-    if scores[best] < scores[0] + MARGIN_DB:
+    if not is_better(scores[best] - scores[0], TRIAL):
         best = 0
     trials = tuple(
         TrialReport(source=c.source, placed=int(c.matched.sum()), psnr=s)
@@ -141,9 +138,9 @@ def _scores_when_decided(running: Sequence[Trial], explained: Sequence[float]) -
 def _decided(scores: Sequence[float], explained: Sequence[float]) -> bool:
     """Whether the best is clearly so, or photos prefer it to all that leave matches unexplained, and it does not."""
     first, second = sorted(scores, reverse=True)[:2]
-    if first >= second + CLEAR_DB:
+    if is_better(first - second, CLEAR_TRIAL):
         return True
     if explained[int(np.argmax(scores))] < EXPLAINS:
         return False
     others = [score for score, share in zip(scores, explained, strict=True) if share < EXPLAINS]
-    return first >= max(others, default=-np.inf) + MARGIN_DB
+    return is_better(first - max(others, default=-np.inf), TRIAL)

@@ -10,16 +10,16 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.errors import InputError, Interrupted
+from biresnerf.judging.compare import FACING_FORWARD, FACING_FORWARD_BOUNDED, is_better
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.methods import Recipe
-from biresnerf.refinement.scene.scene_frame import SceneFrame, scene_frame
+from biresnerf.refinement.scene.scene_frame import scene_frame
 from biresnerf.refinement.views.evaluation import score_views
 from biresnerf.refinement.views.pose_trials import trial_views
 
@@ -28,18 +28,6 @@ logger = logging.getLogger(__name__)
 FIRST_STEPS, SECOND_STEPS = 800, 800
 SAMPLES = 1 << 14  # a step
 MIRROR = np.diag([1.0, 1.0, -1.0])
-# Unseen photos must be predicted this much better than by a mean of photos that resemble them: at 100 px, after 600 to
-# 800 steps with a guessed lens, lund_door +4.3 dB, fern +1.2 dB; cameras around a scene, temple -1.6 dB, lego +0.9 dB.
-# Where a background is known, it alone makes some of the difference.
-BETTER_DB, BETTER_DB_BOUNDED = 1.0, 2.0
-
-
-@dataclass(frozen=True, eq=False)
-class Found:
-    """Poses world_from_cam [n, 4, 4] after a short run, and its mean PSNR (dB) on unseen photos."""
-
-    world_from_cam: NDArray[np.float64]
-    psnr: float
 
 
 def find_forward_facing(
@@ -58,24 +46,40 @@ def find_forward_facing(
         Interrupted: ``should_stop`` returned true.
     """
     frame = scene_frame(np.tile(np.eye(4), (len(images), 1, 1)), images)
+    unseen = trial_views(len(images))
 
-    def run(world_from_cam: NDArray[np.float64], steps: int) -> Found:
-        return _short_run(images, frame, world_from_cam, recipe, steps, should_stop)
+    def run(world_from_cam: NDArray[np.float64], steps: int) -> tuple[NDArray[np.float64], float]:
+        """Poses after stage 1 alone, and mean PSNR of views that move their own pose, but do not train the field."""
+        short = recipe.changed(
+            steps=steps,
+            coarse_steps_min=steps // 4,
+            coarse_steps_max=steps,
+            samples_per_step=min(SAMPLES, recipe.options.samples_per_step),
+        )
+        poses = frame.unit_from_world.apply_to_poses(world_from_cam)
+        optimiser = JointOptimiser(images, frame, poses, short, unseen)
+        for _ in range(steps):
+            if should_stop():
+                raise Interrupted("stopped while poses were looked for without features")
+            optimiser.step()
+        psnr = float(np.mean([score.psnr for score in score_views(optimiser, images, unseen)]))
+        return frame.unit_from_world.inverse().apply_to_poses(optimiser.poses.poses().numpy()), psnr
 
-    first = run(world_from_cam, FIRST_STEPS)
-    tries = [run(rig, SECOND_STEPS) for rig in (first.world_from_cam, mirrored(first.world_from_cam))]
-    logger.info("forward-facing: %.2f dB, mirrored in depth %.2f dB", tries[0].psnr, tries[1].psnr)
-    best = max(tries, key=lambda found: found.psnr)
-    bound = resemblance_psnr(images, trial_views(len(images)))
-    if best.psnr < bound + (BETTER_DB if frame.unbounded else BETTER_DB_BOUNDED):
+    first, _ = run(world_from_cam, FIRST_STEPS)
+    tries = [run(rig, SECOND_STEPS) for rig in (first, mirrored(first))]
+    logger.info("forward-facing: %.2f dB, mirrored in depth %.2f dB", tries[0][1], tries[1][1])
+    best, psnr = max(tries, key=lambda found: found[1])
+    bound = resemblance_psnr(images, unseen)
+    rule = FACING_FORWARD if frame.unbounded else FACING_FORWARD_BOUNDED
+    if not is_better(psnr - bound, rule):
         raise InputError(
             "insufficient_overlap",
-            f"no poses were found that explain the photos: a scene built from some predicts others at {best.psnr:.1f} "
+            f"no poses were found that explain the photos: a scene built from some predicts others at {psnr:.1f} "
             f"dB, the mere mean of similar photos at {bound:.1f} dB.",
             hint="Photos from all around need features that match, or approximate poses; without either, only photos "
             "that look the same way, from nearly one place, can be used, or of something that turned: start=turntable.",
         )
-    return best.world_from_cam
+    return best
 
 
 def mirrored(world_from_cam: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -117,30 +121,3 @@ def _mean_pose(world_from_cam: NDArray[np.float64]) -> NDArray[np.float64]:
     pose[:3, :3] = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right_t)]) @ right_t
     pose[:3, 3] = world_from_cam[:, :3, 3].mean(0)
     return pose
-
-
-def _short_run(
-    images: ImageSet,
-    frame: SceneFrame,
-    world_from_cam: NDArray[np.float64],
-    recipe: Recipe,
-    steps: int,
-    should_stop: Callable[[], bool],
-) -> Found:
-    """Stage 1 alone, from these poses; the views that score it move their own pose, but do not train the field."""
-    unseen = trial_views(len(images))
-    short = recipe.changed(
-        steps=steps,
-        coarse_steps_min=steps // 4,
-        coarse_steps_max=steps,
-        samples_per_step=min(SAMPLES, recipe.options.samples_per_step),
-    )
-    poses = frame.unit_from_world.apply_to_poses(world_from_cam)
-    optimiser = JointOptimiser(images, frame, poses, short, unseen)
-    for _ in range(steps):
-        if should_stop():
-            raise Interrupted("stopped while poses were looked for without features")
-        optimiser.step()
-    psnr = float(np.mean([score.psnr for score in score_views(optimiser, images, unseen)]))
-    found = frame.unit_from_world.inverse().apply_to_poses(optimiser.poses.poses().numpy())
-    return Found(found, psnr)

@@ -46,7 +46,7 @@ from biresnerf.refinement.views.compare_rigs import (
 )
 from biresnerf.refinement.views.held_out_views import ROUNDS_MOST
 from biresnerf.refinement.views.motion import moved_px
-from biresnerf.report import EpipolarEvidence, Verdict
+from biresnerf.report import EpipolarEvidence, Finding, Verdict
 
 logger = logging.getLogger(__name__)
 
@@ -122,7 +122,7 @@ def judge_poses(
     heldout: HeldOutComparison | None = None
     work = 0.0
     if told.moved_px >= MEASURABLE_PX:
-        effort = Effort(pictured=True, favoured=told.favoured_by_matches, moved_px=told.moved_px)
+        effort = Effort(pictured=True, favoured=told.by_matches, moved_px=told.moved_px)
         rounds = max(_rounds(run, 1), 1)
         for each in (effort, replace(effort, times=LONGER, looks=(1.0,))):
             heldout = compare_placed(
@@ -205,15 +205,15 @@ def compare_without_training(scene: Scene, refined: RefinedPoses, lost: int) -> 
         faults=tuple(map(str, dataset.faults)),
         offset=dataset.body_offset is not None,
         by_gimbal=sum(frame.pose_source == "gimbal" for frame in dataset.frames) > len(dataset) / 2,
-        favoured_by_positions=_favoured_by_positions(dataset, before, after, refined.dataset, placed),
+        by_positions=_by_positions(dataset, before, after, refined.dataset, placed),
     )
     return Compared(before, after, placed, turned, shifted, findings)
 
 
-def _favoured_by_positions(
+def _by_positions(
     dataset: Dataset, before: Rig, after: Rig, refined: Dataset, placed: NDArray[np.bool_]
-) -> Literal[-1, 0, 1] | None:
-    """The poses that measured places fit better: 1 the refined ones, -1 the input's; see `Findings`."""
+) -> Finding | None:
+    """What measured places say of the refined poses; see `Findings`."""
     old = measured_evidence(dataset, before.world_from_cam, placed)
     new = measured_evidence(refined, after.world_from_cam, placed)
     if old.positions is None or new.positions is None:
@@ -228,9 +228,9 @@ def _favoured_by_positions(
     found = [alike for _, alike in measured_misfits(rigs).values()]
     better, worse = any(not alike[0] for alike in found), any(not alike[1] for alike in found)
     if better != worse:
-        return 1 if better else -1
+        return "better" if better else "worse"
     stated = new.control is not None or (new.positions is not None and new.positions.stated)
-    return 0 if stated else None
+    return "same" if stated else None
 
 
 def motion(before: Array, after: Array) -> tuple[Array, Array]:

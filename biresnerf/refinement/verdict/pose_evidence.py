@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.comparison.paired import EPIPOLAR_MATTERS, paired
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.points.tracks import Tracks
+from biresnerf.judging.compare import MATCH_ERRORS, octaves, paired
 from biresnerf.refinement.lost.own_matches import LEAST_PX, OwnMatches, well_matched
 from biresnerf.refinement.views.compare_rigs import Rig
 from biresnerf.report import EpipolarEvidence
@@ -39,8 +39,7 @@ def compare_on_matches(
     if known.sum() < LEAST_MATCHED:
         return None
     one, other = (errors[known] for errors in figures)
-    gains = np.log2(np.maximum(one, LEAST_PX) / np.maximum(other, LEAST_PX))
-    comparison = paired(one, other, EPIPOLAR_MATTERS, gains)
+    comparison = paired(one, other, MATCH_ERRORS, octaves(one, other, LEAST_PX))
     medians = {"before": float(np.median(one)), "after": float(np.median(other))}
     sides = [max(camera.width, camera.height) for camera in after.cameras]
     return EpipolarEvidence(

@@ -13,6 +13,7 @@ from biresnerf.data.photos.photo_folders import few_names
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.field.backends import gpu_faults
+from biresnerf.judging.compare import TRIAL, is_better
 from biresnerf.refinement.finish.given_poses import accuracy_report, accuracy_warnings
 from biresnerf.refinement.finish.outcome import Finish
 from biresnerf.refinement.finish.work_ahead import budget_warnings
@@ -23,7 +24,6 @@ from biresnerf.refinement.optimise.method_changes import method_warnings
 from biresnerf.refinement.parameters.intrinsics_parameters import FocalCertainty, IntrinsicsParameters
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.checkpoint import RunRecord
-from biresnerf.refinement.start.choose_start import MARGIN_DB
 from biresnerf.refinement.start.matches_explained import explained_from_one_place
 from biresnerf.refinement.start.refined_poses import RefinedPoses
 from biresnerf.refinement.verdict.judgement import Judgement, motion
@@ -162,9 +162,11 @@ def held_out_report(optimiser: JointOptimiser, scores: Sequence[ViewScore]) -> H
 
 def turntable_warnings(start: InitialPoses) -> tuple[str, ...]:
     """A warning where photos do not tell which way the table turned; empty where they do, or there was none."""
-    if start.source != "turntable" or start.trials[0].psnr >= start.trials[1].psnr + MARGIN_DB:
+    if start.source != "turntable":
         return ()
     better, other = start.trials
+    if is_better(better.psnr - other.psnr, TRIAL):
+        return ()
     return (
         f"The photos hardly show which way the table turned ({better.psnr:.2f} dB, the other way {other.psnr:.2f} dB). "
         "The result may be a mirror image.",

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from biresnerf.comparison.paired import EPIPOLAR_MATTERS
 from biresnerf.data.model.dataset import Dataset
+from biresnerf.judging.compare import LATER_MATCH_ERRORS, compare
 from biresnerf.refinement.finish.expected_errors import expected_errors
 from biresnerf.refinement.finish.gather_evidence import without_patches
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
@@ -57,7 +57,8 @@ def poses_so_far(scene: Scene, optimiser: JointOptimiser, run: RunState) -> SoFa
         return SoFar(now, None)
     verdict = _verdict(scene, optimiser, now)
     gain = 0.0 if verdict.epipolar is None else verdict.epipolar.error_px.difference
-    if verdict.returned == "refined" and (best is None or gain > best.gain - EPIPOLAR_MATTERS):
+    worse = best is not None and compare(gain - best.gain, LATER_MATCH_ERRORS).finding == "worse"
+    if verdict.returned == "refined" and not worse:
         best = BestSoFar(
             unit_from_cam=optimiser.poses.poses().numpy().copy(),
             increments=optimiser.lenses.increments.detach().cpu().numpy().copy(),

@@ -12,9 +12,16 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.comparison.paired import FITS_BELOW
+from biresnerf.judging.compare import FITS_BELOW
 from biresnerf.refinement.views.compare_rigs import photos_tell
-from biresnerf.report import EpipolarEvidence, HeldOutEvidence, PairedDifference, Verdict, VerdictName
+from biresnerf.report import (
+    EpipolarEvidence,
+    Finding,
+    HeldOutEvidence,
+    PairedDifference,
+    Verdict,
+    VerdictName,
+)
 
 Array = NDArray[np.float64]
 
@@ -43,8 +50,8 @@ class Findings:
         offset: whether an offset that all given poses shared was taken back.
         by_gimbal: whether most of the input's poses are those of GPS and a gimbal.
         determined: the share of cameras whose refined poses feature matches and photos determine; None if not known.
-        favoured_by_positions: 1 where measured places fit the refined poses better beyond chance, -1 the input's, 0
-            where neither, and their accuracy is stated; else None.
+        by_positions: what measured places say of the refined poses: same where they fit both alike and their accuracy
+            is stated; None where it is not.
         may_be_blur: whether a gain of unseen views may be blur, and there was no time to see whether it stands.
     """
 
@@ -59,7 +66,7 @@ class Findings:
     faults: tuple[str, ...] = ()
     working_share: float = 1.0
     offset: bool = False
-    favoured_by_positions: Literal[-1, 0, 1] | None = None
+    by_positions: Finding | None = None
     by_gimbal: bool = False
     determined: float | None = None
     may_be_blur: bool = False
@@ -74,11 +81,12 @@ class Findings:
         return EXPLAINED * (self.moved_px - UNEXPLAINED_PX) < lost_px
 
     @property
-    def favoured_by_matches(self) -> Literal[-1, 0, 1]:
-        """The poses that feature matches speak for: 1 the refined ones, -1 the input's, 0 neither."""
+    def by_matches(self) -> Finding:
+        """What feature matches may say of the refined poses: they speak for these where they explain the motion."""
         if self.epipolar is not None and self.epipolar.error_px.finding == "worse":
-            return -1
-        return 1 if matches_are_better(self) and self.explained and not self.undetermined else 0
+            return "worse"
+        better = matches_are_better(self) and self.explained and not self.undetermined
+        return "better" if better else "open"
 
     @property
     def undetermined(self) -> bool:
@@ -137,7 +145,7 @@ def _judge(f: Findings) -> tuple[VerdictName, str]:
         return "failed_check", " ".join(f.failed)
     if f.moved_px < MEASURABLE_PX:
         return "unchanged", f"The poses moved by less than can be measured (below {MEASURABLE_PX:g} px)."
-    speaks_for, speaks_against = _for(f), _against(f)
+    speaks_for, speaks_against = _who_say(f, "better"), _who_say(f, "worse")
     # Positions may be off by more than a narrow rig is wide. Rotations that far off are another arrangement.
     needed = {VIEWS, MATCHES} if f.turned_far else {MATCHES}
     if f.out_of_frame and (speaks_against or not needed <= set(speaks_for)):
@@ -202,9 +210,9 @@ def _found_poses_yield(f: Findings) -> bool:
 
     They do where the refined ones alone heed measured places, or fit left-out matches better.
     """
-    if f.compared_with != "seeded" or f.faults or _against(f):
+    if f.compared_with != "seeded" or f.faults or _who_say(f, "worse"):
         return False
-    heeded = f.favoured_by_positions is not None and f.moved_px >= MEASURABLE_PX
+    heeded = f.by_positions is not None and f.moved_px >= MEASURABLE_PX
     fits = f.epipolar is not None and f.epipolar.share_of_image <= FITS_BELOW
     return heeded or (fits and matches_are_better(f))
 
@@ -217,16 +225,15 @@ def _counted(f: Findings) -> list[PairedDifference]:
     return counted
 
 
-def _for(f: Findings) -> list[str]:
-    """What speaks for the refined poses."""
-    names = []
-    if _views_are_better(f) and (_views_tell(f) or (matches_are_better(f) and not f.undetermined)):
-        names.append(VIEWS)
-    if f.favoured_by_matches > 0:
-        names.append(MATCHES)
-    if f.favoured_by_positions == 1:
-        names.append(POSITIONS)
-    return names
+def _who_say(f: Findings, finding: Finding) -> list[str]:
+    """What says that the refined poses are better, or worse; matches that the start came from may say the latter."""
+    if finding == "better":
+        views = _views_are_better(f) and (_views_tell(f) or (matches_are_better(f) and not f.undetermined))
+    else:
+        views = f.heldout is not None and "worse" in (f.heldout.psnr.finding, f.heldout.ssim.finding)
+        views = views and (_views_tell(f) or f.by_matches != "better")
+    said = {VIEWS: views, MATCHES: f.by_matches == finding, POSITIONS: f.by_positions == finding}
+    return [name for name, says in said.items() if says]
 
 
 def _views_are_better(f: Findings) -> bool:
@@ -242,19 +249,6 @@ def _views_tell(f: Findings) -> bool:
 def matches_are_better(f: Findings) -> bool:
     """Whether independent matches fit the refined poses better, whatever that shows."""
     return f.epipolar is not None and f.epipolar.independent and f.epipolar.error_px.finding == "better"
-
-
-def _against(f: Findings) -> list[str]:
-    """What speaks against them; matches that the start came from may do so as well."""
-    names = []
-    worse = f.heldout is not None and "worse" in (f.heldout.psnr.finding, f.heldout.ssim.finding)
-    if worse and (_views_tell(f) or f.favoured_by_matches <= 0):
-        names.append(VIEWS)
-    if f.favoured_by_matches < 0:
-        names.append(MATCHES)
-    if f.favoured_by_positions == -1:
-        names.append(POSITIONS)
-    return names
 
 
 def _named(evidence: list[str]) -> str:

@@ -4,28 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.comparison.paired import PSNR_MATTERS, SSIM_MATTERS, paired
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.workload import LOOKS, picture_share
 from biresnerf.geometry.camera.camera_models import Camera
+from biresnerf.judging.compare import UNSEEN_PSNR, UNSEEN_SSIM, compare, paired
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.views.held_out_views import ROUNDS_MOST, unseen_rounds
 from biresnerf.refinement.views.image_metrics import shift_px
 from biresnerf.refinement.views.pose_trials import PoseTrials, Trial, TrialScores, joined
-from biresnerf.report import HeldOutEvidence
+from biresnerf.report import Finding, HeldOutEvidence
 
 Array = NDArray[np.float64]
 BeforeAfter = dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]]
 
 SHOWN = 4  # held-out views that are rendered with either rig, to be looked at
-# Differences that matter and are larger than chance: trainings on the same poses differ by less (docs/verdict.md).
 # Poses that photos miss by less than half of a motion are nearer to the truth than those before it: the triangle's
 # inequality. Short trainings blur, and so miss by up to so much at true poses (px at working size, docs/verdict.md).
 NEARER, BLUR_PX = 0.5, 2.0
@@ -63,7 +61,7 @@ class Effort:
         rounds_most: small sets are trained so often, with other views left out, unless the first ones decide.
         looks: shares of a training after which fields are compared; the last is 1.
         pictured: whether some held-out views are rendered with either rig, to be looked at.
-        favoured: the rig that other evidence favours: 1 the second, -1 the first, 0 none.
+        favoured: what other evidence says of the second rig.
         moved_px: how far the scene moves in the image between the rigs, where that is of account.
     """
 
@@ -71,7 +69,7 @@ class Effort:
     rounds_most: int = ROUNDS_MOST
     looks: tuple[float, ...] = LOOKS
     pictured: bool = False
-    favoured: Literal[-1, 0, 1] = 0
+    favoured: Finding = "open"
     moved_px: float = np.inf
 
 
@@ -135,10 +133,12 @@ def compare_on_unseen_views(
             old, new = (joined(side) for side in zip(*earlier, scores, strict=True))
             strictly = len(set(seen) & set(held_out))
             nearer = new if new.psnr.mean() >= old.psnr.mean() else old
-            evidence = _evidence(
-                old, new, running[0].optimiser.step_index, strictly, _missed_px(nearer, images, seen)
-            )
-            decided = _decided(evidence, EARLY if look < 1 else 1, effort)
+            missed_px = _missed_px(nearer, images, seen)
+            evidence = HeldOutEvidence(
+                steps=running[0].optimiser.step_index, strictly=strictly, missed_px=missed_px,
+                psnr=paired(old.psnr, new.psnr, UNSEEN_PSNR), ssim=paired(old.ssim, new.ssim, UNSEEN_SSIM),
+            )  # fmt: skip
+            decided = _decided(old, new, missed_px, EARLY if look < 1 else 1, effort)
             if pictured and (decided or look == 1):
                 renders = _pictures(running, [view for view in views if view in held_out][:SHOWN], enough)
             did = work + sum(trial.work for trial in running)
@@ -173,39 +173,25 @@ def photos_tell(missed_px: float, moved_px: float) -> bool:
 
 def may_be_blur(evidence: HeldOutEvidence, effort: Effort) -> bool:
     """Whether a gain may be that of poses which a short training's blur suits, and nothing else speaks for them."""
-    if effort.favoured > 0 or evidence.psnr.finding != "better" or evidence.missed_px is None:
+    if effort.favoured == "better" or evidence.psnr.finding != "better" or evidence.missed_px is None:
         return False
     return NEARER * effort.moved_px < evidence.missed_px <= BLUR_PX
 
 
-def _evidence(
-    before: TrialScores, after: TrialScores, steps: int, strictly: int, missed_px: float
-) -> HeldOutEvidence:
-    psnr, ssim = (
-        paired(before.psnr, after.psnr, PSNR_MATTERS),
-        paired(before.ssim, after.ssim, SSIM_MATTERS),
-    )
-    return HeldOutEvidence(steps=steps, strictly=strictly, psnr=psnr, ssim=ssim, missed_px=missed_px)
-
-
-def _decided(evidence: HeldOutEvidence, times: float, effort: Effort) -> bool:
+def _decided(before: TrialScores, after: TrialScores, missed_px: float, times: float, effort: Effort) -> bool:
     """Whether both intervals lie beyond so many times what matters, on the same side; or beyond 0, on the favoured one.
 
     Other views, or more steps, would hardly change that. They may where a gain is not enough to tell yet.
     """
-    told = evidence.missed_px is None or photos_tell(evidence.missed_px, effort.moved_px)
-    both = ((evidence.psnr, PSNR_MATTERS), (evidence.ssim, SSIM_MATTERS))
-    for side in (1, -1):
-        nearest = [found.low if side > 0 else found.high for found, _ in both]
-        if not told and side != effort.favoured:
-            continue
-        beyond = 0 if side == effort.favoured else times
-        if all(
-            end is not None and side * end > beyond * matters
-            for end, (_, matters) in zip(nearest, both, strict=True)
-        ):
-            return True
-    return False
+    both = ((after.psnr - before.psnr, UNSEEN_PSNR), (after.ssim - before.ssim, UNSEEN_SSIM))
+
+    def says(side: Finding, times: float) -> bool:
+        beyond = ((gains, replace(rule, least=0.0, beyond=times * rule.least)) for gains, rule in both)
+        return all(compare(*each).finding == side for each in beyond)
+
+    if effort.favoured in ("better", "worse") and says(effort.favoured, 0):
+        return True
+    return photos_tell(missed_px, effort.moved_px) and (says("better", times) or says("worse", times))
 
 
 def compare_placed(

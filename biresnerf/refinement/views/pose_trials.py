@@ -54,7 +54,7 @@ def joined(parts: Sequence[TrialScores]) -> TrialScores:
 
 
 class PoseTrials:
-    """Scores sets of poses, one after the other, under the same conditions.
+    """Begins trainings of sets of poses, one after the other, under the same conditions.
 
     Args:
         images: photos at working size.
@@ -88,21 +88,6 @@ class PoseTrials:
         )
         self._should_stop = should_stop
         self._sampler = sampler or PhotoSampler(images, self.unseen, recipe.device, recipe.method.by_detail)
-
-    def score(
-        self,
-        world_from_cam: NDArray[np.float64],
-        cameras: tuple[Camera, ...] | None = None,
-        *,
-        moving: bool = False,
-    ) -> TrialScores:
-        """Train a field on all but the unseen views, from these poses and lenses, and score it on the unseen.
-
-        Args and errors are those of `begin` and `Trial.train`.
-        """
-        trial = self.begin(world_from_cam, cameras, moving=moving)
-        trial.train(1.0)
-        return trial.scores()
 
     def begin(
         self,

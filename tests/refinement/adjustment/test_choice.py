@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_1samp
 
-from biresnerf.refinement.adjustment.choice import Candidate, choose, fits_better
+from biresnerf.refinement.adjustment.choice import Candidate, choose, judged
 from biresnerf.report import CandidateName
 
 CAMERAS = 12
@@ -100,7 +100,7 @@ def test_chance_chooses_other_poses_rarely(seed):
 def test_beyond_chance_is_as_in_students_test(cameras):
     rng = np.random.default_rng(cameras)
     gains = rng.normal(0, 0.3, (400, cameras)) + rng.uniform(0, 1, (400, 1))
-    found = np.array([fits_better(2.0 ** (-2 * each), np.ones(cameras)) for each in gains])
+    found = np.array([judged(np.ones(cameras), 2.0 ** (-2 * each)) == "better" for each in gains])
     tested = ttest_1samp(gains, 0, axis=1)
     clear = abs(tested.pvalue - 0.05) > 1e-3
     assert 0.1 < found.mean() < 0.9

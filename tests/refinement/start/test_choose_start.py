@@ -13,6 +13,7 @@ from biresnerf.data.points.tracks import Tracks
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.errors import Interrupted
 from biresnerf.geometry.perturb import perturb_poses
+from biresnerf.judging.compare import Rule
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.progress import Monitor
 from biresnerf.refinement.optimise.methods import Recipe
@@ -82,7 +83,7 @@ def test_trials_end_once_one_is_clearly_better(scene, monkeypatch):
 
 def test_trials_end_once_photos_prefer_poses_that_alone_explain_the_matches(scene, monkeypatch):
     monkeypatch.setattr(start_module, "TRIAL_STEPS", 120)
-    monkeypatch.setattr(start_module, "CLEAR_DB", 50.0)
+    monkeypatch.setattr(start_module, "CLEAR_TRIAL", Rule(least=50.0, errors=0))
     dataset, images = scene
     truth, tracks = dataset.world_from_cam, true_matches(dataset, noise_px=0.01)
     noisy = perturb_poses(truth, 0.3, seed=1)
@@ -171,13 +172,16 @@ def test_poses_that_may_move_in_a_trial_improve(scene):
     dataset, images = scene
     noisy = perturb_poses(dataset.world_from_cam, 0.05, seed=1)
     trials = PoseTrials(images, trial_views(VIEWS), [noisy], tiny_recipe(), 150, lambda: False)
-    assert trials.score(noisy, moving=True).psnr.mean() > trials.score(noisy).psnr.mean() + 0.5
+    held, moved = (trials.begin(noisy, moving=moving) for moving in (False, True))
+    for trial in (held, moved):
+        trial.train(1.0)
+    assert moved.scores().psnr.mean() > held.scores().psnr.mean() + 0.5
 
 
 def test_where_poses_as_they_are_do_not_tell_those_win_that_improve_with_the_field(scene, monkeypatch):
     """As of a symmetric thing, whose matches give a model that is consistent but wrong."""
     dataset, images = scene
-    monkeypatch.setattr(start_module, "CLEAR_DB", 50.0)
+    monkeypatch.setattr(start_module, "CLEAR_TRIAL", Rule(least=50.0, errors=0))
     noisy = perturb_poses(dataset.world_from_cam, 0.05, seed=1)
     folded = dataset.world_from_cam[np.arange(VIEWS) // 2]  # half of the views stand where others do
     chosen = choose(images, candidates(dataset, folded, noisy))

@@ -13,6 +13,7 @@ from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.images import ImageSet, load_images
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.perturb import perturb_poses
+from biresnerf.judging.compare import Rule
 from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.verdict.image_flags import blurred, exposure_off, moved_far, sharpness
 from biresnerf.refinement.verdict.judgement import Judgement, judge_poses
@@ -141,7 +142,7 @@ def test_trainings_end_once_they_decide_but_for_pictures(scene, monkeypatch):
 
 
 def test_trainings_end_once_they_agree_with_what_matches_say(scene, monkeypatch):
-    monkeypatch.setattr(compare_rigs, "PSNR_MATTERS", 50.0)  # so large a gain there is not
+    monkeypatch.setattr(compare_rigs, "UNSEEN_PSNR", Rule(least=50.0))  # so large a gain there is not
     dataset, images = scene
     truth, noisy = dataset.world_from_cam, perturb_poses(dataset.world_from_cam, 0.3, seed=1)
     options = OPTIONS.model_copy(update={"trial_steps": 80})
@@ -289,8 +290,10 @@ def test_trainings_are_the_same_again(scene):
     trials = pose_trials.PoseTrials(
         images, [2, 6], [dataset.world_from_cam], Recipe.of(OPTIONS, CPU, 2), 20, lambda: False
     )
-    first, again = trials.score(dataset.world_from_cam), trials.score(dataset.world_from_cam)
-    np.testing.assert_array_equal(first.psnr, again.psnr)
+    first, again = trials.begin(dataset.world_from_cam), trials.begin(dataset.world_from_cam)
+    for trial in (first, again):
+        trial.train(1.0)
+    np.testing.assert_array_equal(first.scores().psnr, again.scores().psnr)
 
 
 def test_matches_of_points_left_out_judge_and_photos_placed_by_a_guess_do_not(scene, noisy):

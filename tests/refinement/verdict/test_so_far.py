@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from biresnerf.comparison.paired import EPIPOLAR_MATTERS
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import pose_error
+from biresnerf.judging.compare import LATER_MATCH_ERRORS
 from biresnerf.refinement.stages.checkpoint import load_checkpoint
 from biresnerf.refinement.verdict import judgement
 from biresnerf.refinement.verdict.so_far import UNMEASURED, SoFar, poses_so_far
@@ -120,7 +120,7 @@ def test_poses_that_matches_cannot_tell_from_the_best_take_its_place_but_never_d
     taken = [run.at(0.01 + 0.0001 * step) for step in range(40)]
     said = [offered.verdict.epipolar.error_px.difference for offered in taken]
     assert len(set(said)) > 2, "some of them were taken"
-    assert min(said) > best - EPIPOLAR_MATTERS
+    assert min(said) > best - LATER_MATCH_ERRORS.least
     assert len(set(said[-10:])) == 1, "and others were not"
 
 
