@@ -2,6 +2,7 @@
 
 Options, the client and the web process need a format's name and properties, but must not load its reader, which needs
 NumPy. A declaration therefore has literal values only, and is read from the module's source without importing it.
+Other packages add formats by an entry point of the group `GROUP`, which names a module.
 `biresnerf.data.formats.registry` adds the functions that read and write.
 """
 
@@ -12,6 +13,8 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
+from importlib.metadata import entry_points
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
@@ -20,6 +23,7 @@ Loss = Literal[
     "poses", "names", "lenses", "some lenses", "distortion", "rigs", "points", "mask paths", "masks"
 ]
 
+GROUP = "biresnerf.formats"
 _PACKAGE = Path(__file__).resolve().parents[2]
 _FOLDER = _PACKAGE / "biresnerf" / "data" / "formats"
 _DECLARATION = re.compile(r"^\w+ = Format\(\n.*?^\)$", re.MULTILINE | re.DOTALL)
@@ -103,17 +107,29 @@ class Format:
 @cache
 def formats() -> dict[str, Format]:
     """All formats by name, in the order of their ranks."""
-    found = [declared for path in sorted(_FOLDER.rglob("*.py")) for declared in _declared_in(path)]
+    places = {point.module: _source_of(point.module) for point in entry_points(group=GROUP)}
+    for path in sorted(_FOLDER.rglob("*.py")):
+        places[".".join(path.relative_to(_PACKAGE).with_suffix("").parts).removesuffix(".__init__")] = path
+    found = [declared for module, path in places.items() for declared in _declared_in(path, module)]
     return {declared.name: declared for declared in sorted(found, key=lambda declared: declared.rank)}
 
 
-def _declared_in(path: Path) -> Iterator[Format]:
+def _source_of(module: str) -> Path:
+    """The file of a module, which is not imported; the packages that it lies in are."""
+    found = find_spec(module)
+    if found is None or found.origin is None:
+        raise ModuleNotFoundError(
+            f"An entry point of {GROUP} names {module}, which is not there.", name=module
+        )
+    return Path(found.origin)
+
+
+def _declared_in(path: Path, module: str) -> Iterator[Format]:
     """The declarations ``NAME = Format(...)`` of a module, the closing bracket on a line of its own."""
     for match in _DECLARATION.finditer(path.read_text("utf-8")):
         call = ast.parse(match[0].split(" = ", 1)[1], mode="eval").body
         assert isinstance(call, ast.Call)
         values = {str(keyword.arg): ast.literal_eval(keyword.value) for keyword in call.keywords}
-        module = ".".join(path.relative_to(_PACKAGE).with_suffix("").parts).removesuffix(".__init__")
         yield Format(**values, module=module)
 
 

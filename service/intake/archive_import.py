@@ -22,6 +22,7 @@ from service.intake.uploads import capped, staging_folder, write_stream
 from workers.process.waiting import retry_while_unavailable
 from workers.records import Upload
 from workers.settings.errors import EngineError, NotFound, Unavailable
+from workers.store.measured_stream import MeasuredStream
 
 logger = logging.getLogger(__name__)
 
@@ -170,15 +171,8 @@ async def _add_to_dataset(service: Service, upload: Upload) -> None:
         return
     async with staging_folder(service.staging_dir) as folder:
         archive = folder / "archive"
-        await write_stream(capped(uploads.content(upload), upload.size, budget=service.disk_budget), archive)
-        if upload.sha256 is not None:
-            found = await asyncio.to_thread(file_sha256, archive)
-            if found != upload.sha256:
-                raise ProblemError(
-                    "digest_mismatch",
-                    f"What arrived has SHA-256 {found}, announced was {upload.sha256}.",
-                    hint="Send the archive again.",
-                )
+        content = MeasuredStream("archive", uploads.content(upload), upload.size, upload.sha256).all_with(b"")
+        await write_stream(capped(content, upload.size, budget=service.disk_budget), archive)
         await import_archive(service, upload.dataset_id, archive, upload.id)
 
 

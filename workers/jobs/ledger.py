@@ -88,14 +88,11 @@ class Ledger:
         """Write the progress columns, and the options where they are reported; a new stage is also an event."""
         resolved = None if now.options is None else Jsonb(now.options.model_dump(mode="json"))
         await connection.execute(
-            "UPDATE jobs SET stage = %s, fraction = greatest(fraction, %s), step = %s, steps_total = %s,"
-            " eta_s = %s, metrics = metrics || %s, message = %s,"
-            " resolved_options = coalesce(%s, resolved_options), revision = revision + 1,"
-            " updated_at = clock_timestamp() WHERE id = %s",
-            (
-                *(now.stage, now.fraction, now.step, now.steps_total, now.eta_s),
-                *(Jsonb(now.metrics), now.message, resolved, job["id"]),
-            ),
+            "UPDATE jobs SET stage = %(stage)s, fraction = greatest(fraction, %(fraction)s), step = %(step)s,"
+            " steps_total = %(steps_total)s, eta_s = %(eta_s)s, metrics = metrics || %(metrics)s,"
+            " message = %(message)s, resolved_options = coalesce(%(options)s, resolved_options),"
+            " revision = revision + 1, updated_at = clock_timestamp() WHERE id = %(id)s",
+            {**dict(now), "metrics": Jsonb(now.metrics), "options": resolved, "id": job["id"]},
         )
         if now.stage != job["stage"]:
             await _add_event(connection, job, "stage", {"stage": now.stage})

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,30 @@ from biresnerf.uncertainty import PoseUncertainty
 PointsSource = Literal["none", "given", "features", "tracks", "moved", "field"]
 REFINED = "refined"  # where a result that returns the input's poses has the refined ones
 BODY = "body"  # where a result has the poses of what carries the camera
+
+
+class Landmark(NamedTuple):
+    """One point of a result, with what photos show of it.
+
+    Attributes:
+        number: its id.
+        xyz, rgb: position in the world; colour, 0 to 255.
+        features: row of the image in the set, number of the feature, and its x and y, px. COLMAP may list several
+            features of an image.
+    """
+
+    number: int
+    xyz: list[float]
+    rgb: list[int]
+    features: list[tuple[int, int, list[float]]]
+
+    @property
+    def seen(self) -> dict[int, tuple[int, list[float]]]:
+        """By the image's row, for programs in which a view sees a point once: the first feature."""
+        seen: dict[int, tuple[int, list[float]]] = {}
+        for row, feature, xy in self.features:
+            seen.setdefault(row, (feature, xy))
+        return seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +128,19 @@ class RefinedSet:
     def camera_of(self, index: int) -> Camera:
         """The camera that took image ``index``."""
         return self.cameras[self.images[index].camera]
+
+    def landmarks(self) -> Iterator[Landmark]:
+        """All points of the model."""
+        points, row_of = self.model.points, {number: row for row, number in enumerate(self.image_ids)}
+        columns = (points.ids, points.xyz, points.rgb, points.track_starts, points.track_starts[1:])
+        images, features = points.track_image_ids.tolist(), points.track_point2d_indices.tolist()
+        for number, xyz, rgb, start, end in zip(*(column.tolist() for column in columns), strict=False):
+            shown = [
+                (row_of[image], feature, self.model.images[image].points2d_px[feature].tolist())
+                for image, feature in zip(images[start:end], features[start:end], strict=True)
+                if image in row_of
+            ]
+            yield Landmark(number, xyz, rgb, shown)
 
     def of_body(self, offset: BodyOffset) -> RefinedSet:
         """The set with the poses of what carries the camera; without points, rigs and bounds of the cameras."""

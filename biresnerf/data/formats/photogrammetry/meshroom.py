@@ -23,11 +23,10 @@ from pydantic import BaseModel
 from biresnerf.data.formats.codec import BROWN, FISHEYE, Codec, LensLimits, head_holds
 from biresnerf.data.formats.colmap.model_checks import listed_name
 from biresnerf.data.formats.parsed_poses import ParsedPoses
-from biresnerf.data.formats.photogrammetry.landmarks import Landmark, landmarks
 from biresnerf.data.formats.photogrammetry.views import View, listed, parsed_views, pose_of_centre
 from biresnerf.data.formats.pose_rows import folder_with_photos, lens_of
 from biresnerf.data.model.atomic_file import write_json
-from biresnerf.data.model.refined_set import RefinedSet
+from biresnerf.data.model.refined_set import Landmark, RefinedSet
 from biresnerf.data.model.untrusted_file import checked, invalid_file, read_json_object
 from biresnerf.data.photos.panoramas.panorama import panorama_camera
 from biresnerf.errors import InputError
@@ -210,7 +209,7 @@ def write_meshroom(refined: RefinedSet, path: Path) -> None:
             }
             for row, pose in enumerate(refined.world_from_cam, start=1)
         ],
-        "structure": [_landmark(one) for one in landmarks(refined)],
+        "structure": [_landmark(one) for one in refined.landmarks()],
     }
     write_json(path, document)
 

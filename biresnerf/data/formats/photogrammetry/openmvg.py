@@ -20,11 +20,10 @@ from pydantic import BaseModel
 from biresnerf.data.formats.codec import BROWN, FISHEYE, Codec, LensLimits, head_holds
 from biresnerf.data.formats.colmap.model_checks import listed_name
 from biresnerf.data.formats.parsed_poses import ParsedPoses
-from biresnerf.data.formats.photogrammetry.landmarks import Landmark, landmarks
 from biresnerf.data.formats.photogrammetry.views import View, listed, parsed_views, pose_of_centre
 from biresnerf.data.formats.pose_rows import folder_with_photos, lens_of
 from biresnerf.data.model.atomic_file import write_json
-from biresnerf.data.model.refined_set import RefinedSet
+from biresnerf.data.model.refined_set import Landmark, RefinedSet
 from biresnerf.data.model.untrusted_file import checked, invalid_file, read_json_object
 from biresnerf.data.photos.panoramas.panorama import panorama_camera
 from biresnerf.geometry.camera.camera_models import Camera, FullParameters
@@ -173,7 +172,7 @@ def write_openmvg(refined: RefinedSet, path: Path) -> None:
             {"key": row, "value": {"rotation": pose[:3, :3].T.tolist(), "center": pose[:3, 3].tolist()}}
             for row, pose in enumerate(refined.world_from_cam)
         ],
-        "structure": [_landmark(one) for one in landmarks(refined)],
+        "structure": [_landmark(one) for one in refined.landmarks()],
         "control_points": [],
     }
     write_json(path, document)

@@ -194,7 +194,6 @@ def write_opensfm(refined: RefinedSet, path: Path) -> None:
             "camera": str(image.camera),
             "orientation": 1,
         }
-    points = refined.model.points
     write_json(
         path,
         [
@@ -202,10 +201,7 @@ def write_opensfm(refined: RefinedSet, path: Path) -> None:
                 "cameras": {str(index): _lens(camera) for index, camera in enumerate(refined.cameras)},
                 "shots": shots,
                 "points": {
-                    str(number): {"coordinates": xyz, "color": rgb}
-                    for number, xyz, rgb in zip(
-                        points.ids.tolist(), points.xyz.tolist(), points.rgb.tolist(), strict=True
-                    )
+                    str(one.number): {"coordinates": one.xyz, "color": one.rgb} for one in refined.landmarks()
                 },
             }
         ],

@@ -160,20 +160,13 @@ def write_bundler(refined: RefinedSet, folder: Path) -> None:
 
 
 def _point_lines(refined: RefinedSet) -> list[str]:
-    model, points = refined.model, refined.model.points
-    row_of_id = {number: row for row, number in enumerate(refined.image_ids)}
     lines = []
-    for k in range(len(points)):
-        track = slice(int(points.track_starts[k]), int(points.track_starts[k + 1]))
+    for one in refined.landmarks():
         views = []
-        for image_id, keypoint in zip(
-            points.track_image_ids[track].tolist(), points.track_point2d_indices[track].tolist(), strict=True
-        ):
-            row = row_of_id[image_id]
+        for row, feature, (x, y) in one.features:
             camera = refined.camera_of(row)
-            x, y = model.images[image_id].points2d_px[keypoint].tolist()
-            views.append(f"{row} {keypoint} {x - camera.width / 2!r} {camera.height / 2 - y!r}")
-        lines += [" ".join(map(repr, row)) for row in (points.xyz[k].tolist(), points.rgb[k].tolist())]
+            views.append(f"{row} {feature} {x - camera.width / 2!r} {camera.height / 2 - y!r}")
+        lines += [" ".join(map(repr, values)) for values in (one.xyz, one.rgb)]
         lines.append(" ".join([str(len(views)), *views]))
     return lines
 

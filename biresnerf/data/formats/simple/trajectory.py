@@ -94,14 +94,16 @@ def parse_trajectory(root: Path, file: Path) -> ParsedPoses:
     trajectory = Trajectory(file)
     lens, cam_from_pose, camera_files = read_camera_file(root, _PHOTO_FOLDERS)
     pose_from_cam = np.linalg.inv(cam_from_pose)
-    times: Sequence[float | None] = trajectory.times_s or [None] * len(trajectory.poses)
-    rows = zip(trajectory.names(), trajectory.poses, trajectory.lines, times, strict=True)
+    times: Sequence[float | None] = trajectory.times_s or [None] * len(trajectory.entries)
     entries = [
-        PoseEntry(name, pose @ pose_from_cam, f"{file.name} line {line}", lens, timestamp_s=time)
-        for name, pose, line, time in rows
+        replace(
+            entry,
+            world_from_cam=None if entry.world_from_cam is None else entry.world_from_cam @ pose_from_cam,
+            lens=lens,
+            timestamp_s=time,
+        )
+        for entry, time in zip(trajectory.entries, times, strict=True)
     ]
-    for index, bad in trajectory.problems.items():
-        entries[index] = replace(bad, name=entries[index].name, lens=lens)
 
     def assign(names: Sequence[str]) -> Assignment:
         pose_of, how = matched(trajectory, names, root)
@@ -129,7 +131,7 @@ def matched(trajectory: Trajectory, names: Sequence[str], root: Path) -> tuple[d
     Raises:
         InputError: ``pose_count_mismatch``.
     """
-    count, times = len(trajectory.poses), trajectory.times_s
+    count, times = len(trajectory.entries), trajectory.times_s
     named = trajectory.image_names
     if named and all(named) and len(set(named)) == count:
         found, _ = match_files(named, names)
@@ -163,7 +165,7 @@ def matched(trajectory: Trajectory, names: Sequence[str], root: Path) -> tuple[d
             by_frame = {names[frame]: i for i, frame in enumerate(frames)}
             return by_frame, f"by number, {_FRAME_RATE} images a second, in the order of the images' names"
     if count == len(names):
-        ordered, note = names_of_poses(names, trajectory.poses)
+        ordered, note = names_of_poses(names, [entry.world_from_cam for entry in trajectory.entries])
         how = "in the order of the images' names" + (note and f"; {note}")
         return {name: i for i, name in enumerate(ordered)}, how
     raise InputError(

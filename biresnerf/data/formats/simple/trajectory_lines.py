@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
-from biresnerf.data.formats.bad_frames import attempt
 from biresnerf.data.formats.colmap.model_checks import rigid_pose
-from biresnerf.data.formats.parsed_poses import PoseEntry
+from biresnerf.data.formats.pose_rows import MAX_ROWS, Placed, entry_of
 from biresnerf.data.formats.simple.times_of_images import number_of
 from biresnerf.data.model.colmap_scene import matrix_of_pose
 from biresnerf.data.model.pose_validation import rigid_matrix
@@ -20,7 +17,6 @@ from biresnerf.data.model.untrusted_file import finite_numbers, read_text
 from biresnerf.errors import InputError
 
 IMAGES_OF = "{stem}_images.txt"  # beside our KITTI files, which have no room for names: an image a line
-MAX_POSES = 100_000
 _HINT = "Give lines of `time x y z qx qy qz qw` (TUM; without times, as many as images), or [R | t] by rows (KITTI)."
 _COLUMNS: dict[int, str] = {7: "tum", 8: "tum", 12: "kitti"}
 # What `refine` writes above its poses: which image was taken when.
@@ -28,36 +24,36 @@ _NAMED_TIME = re.compile(r"#\s*([-+0-9.eE]+)\s+(\S.*\S|\S)\s*$")
 
 
 class Trajectory:
-    """Poses in the file's order; ``times_s`` and the names of images by time where the file has them.
+    """Poses in the file's order, called by their images, times or numbers; bad ones of a file without times included.
 
-    ``problems`` has the bad ones among the poses, by index; ``left_out`` the bad lines that are no pose.
+    ``times_s`` and the names of images by time are there where the file has them; ``left_out`` are bad lines, which
+    are no pose as they have a time or another number of words.
     """
 
     def __init__(self, file: Path) -> None:
         self.file = file
-        self.poses: list[NDArray[np.float64]] = []
         self.times_s: list[float] = []
-        self.lines: list[int] = []
         self.name_of_time: dict[float, str] = {}
-        self.left_out: list[PoseEntry] = []
-        self.problems: dict[int, PoseEntry] = {}
-        rows: list[tuple[int, list[str]]] = []
+        rows: list[tuple[str, list[str]]] = []
         for number, line in enumerate(read_text(file).splitlines(), start=1):
             words = line.replace(",", " ").split()
             if not words or line.lstrip().startswith("#"):
                 self._note_name(line)
             elif rows or not all(number_of(word) is None for word in words):  # else a header without its mark
-                rows.append((number, words))
-            if len(rows) > MAX_POSES:
-                raise _invalid(f"{file.name} line {number}", f"more than {MAX_POSES} poses are not read.")
+                rows.append((f"{file.name} line {number}", words))
+            if len(rows) > MAX_ROWS:
+                raise _invalid(f"{file.name} line {number}", f"more than {MAX_ROWS} poses are not read.")
         lengths = Counter(len(words) for _, words in rows if len(words) in _COLUMNS)
         columns = lengths.most_common(1)[0][0] if lengths else 0
-        for number, words in rows:
-            self._add(number, words, columns)
-        if not self.poses:
-            raise next(
-                (one.problem for one in self.left_out if one.problem), _invalid(file.name, "holds no pose.")
-            )
+        read = [entry_of(where, where, partial(_read, words, columns, where)) for where, words in rows]
+        timed = columns == 8
+        entries = [entry for entry in read if not timed or entry.problem is None]
+        self.left_out = [entry for entry in read if timed and entry.problem is not None]
+        if not any(entry.problem is None for entry in entries):
+            raise next((one.problem for one in read if one.problem), _invalid(file.name, "holds no pose."))
+        if timed:
+            words_at = dict(rows)
+            self.times_s = [float(words_at[entry.where][0]) for entry in entries]
         self.dialect = _COLUMNS[columns]
         self.image_names = [self.name_of_time.get(time, "") for time in self.times_s]
         list_file = file.with_name(IMAGES_OF.format(stem=file.stem))
@@ -65,28 +61,18 @@ class Trajectory:
         if not self.times_s and list_file.is_file():
             self.files.append(list_file)
             self.image_names = read_text(list_file).splitlines()
-            if len(self.image_names) != len(self.poses):
+            if len(self.image_names) != len(entries):
                 raise _invalid(
-                    list_file.name, f"names {len(self.image_names)} images for {len(self.poses)} poses."
+                    list_file.name, f"names {len(self.image_names)} images for {len(entries)} poses."
                 )
         if len(set(self.times_s)) != len(self.times_s):
             raise _invalid(file.name, "two poses have the same time.")
-
-    def _add(self, number: int, words: list[str], columns: int) -> None:
-        """The pose of a line; a bad line with a time is left out, one without keeps its place among the others."""
-        where = f"{self.file.name} line {number}"
-        found = attempt(partial(_pose_of, words, columns, where))
-        if not isinstance(found, InputError):
-            time, pose = found
-            self.poses.append(pose)
-            self.times_s += [] if time is None else [time]
-            self.lines.append(number)
-            return
-        self.left_out.append(PoseEntry(f"line {number}", None, where, problem=found))
-        if columns != 8:
-            self.problems[len(self.poses)] = self.left_out.pop()
-            self.poses.append(np.eye(4))
-            self.lines.append(number)
+        called = self.image_names or [""] * len(entries)
+        others = [f"{time:.17g}" for time in self.times_s] or [str(index) for index in range(len(entries))]
+        self.entries = [
+            replace(entry, name=name or other)
+            for entry, name, other in zip(entries, called, others, strict=True)
+        ]
 
     def _note_name(self, line: str) -> None:
         match = _NAMED_TIME.match(line.strip())
@@ -94,22 +80,15 @@ class Trajectory:
         if match and time is not None:
             self.name_of_time[time] = match[2]
 
-    def names(self) -> list[str]:
-        """A name for each pose: the image's where the file has one, else the time, else the pose's number from 0."""
-        if not self.times_s:
-            return self.image_names or [str(index) for index in range(len(self.poses))]
-        return [name or f"{time:.17g}" for name, time in zip(self.image_names, self.times_s, strict=True)]
 
-
-def _pose_of(words: list[str], columns: int, where: str) -> tuple[float | None, NDArray[np.float64]]:
-    """The time, where the form has it, and the pose of a line."""
+def _read(words: list[str], columns: int, where: str) -> Placed:
     if len(words) not in _COLUMNS or len(words) != columns:
         raise _invalid(where, f"has {len(words)} numbers, not 8 or 7 (TUM) or 12 (KITTI) as every line.")
     values = finite_numbers(words, where, _HINT)
-    if columns < 12:
-        *time, a, b, c, x, y, z, w = values.tolist()
-        return (time[0] if time else None), matrix_of_pose(rigid_pose([w, x, y, z, a, b, c], where, _HINT))
-    return None, rigid_matrix(values.reshape(3, 4).tolist(), where)[0]
+    if columns == 12:
+        return rigid_matrix(values.reshape(3, 4).tolist(), where)[0], None
+    x, y, z, a, b, c, w = values[-7:].tolist()
+    return matrix_of_pose(rigid_pose([w, a, b, c, x, y, z], where, _HINT)), None
 
 
 def _invalid(where: str, what: str, code: str = "pose_file_invalid") -> InputError:
