@@ -211,7 +211,7 @@ CODECS = (
         REALITYCAPTURE,
         parse=parse_realitycapture,
         recognises=lambda file: (
-            head_holds(b"#name,")(file)
+            head_holds(b"#name,", b"#name;", b"#name\t")(file)
             and (head_holds(b"heading")(file) or head_holds(b"omega,phi,kappa")(file))
         ),
         write=lambda refined, path, _: write_realitycapture(refined, path),

@@ -54,6 +54,16 @@ def test_columns_that_a_lens_does_not_need_may_be_missing_and_a_count_may_stand_
     assert_reads_as(read_dataset(tmp_path), refined, "realitycapture")
 
 
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_semicolons_and_tabs_may_stand_between_columns(tmp_path, separator):
+    refined = made("OPENCV")
+    write_photos(tmp_path, refined)
+    write_realitycapture(refined, tmp_path / "out.csv")
+    text = (tmp_path / "out.csv").read_text().replace(",", separator)
+    (tmp_path / "out.csv").write_text("# exported on a Tuesday\n" + text)
+    assert_reads_as(read_dataset(tmp_path), refined, "realitycapture")
+
+
 @pytest.mark.parametrize(
     ("row", "column", "value", "code"),
     [

@@ -60,6 +60,7 @@ def test_poses_json_keeps_what_is_said_of_each_pose(refined, tmp_path):
         "image,x,y,z,qw,qx,qy,qz",
         "filename;tx;ty;tz;q_w;q_x;q_y;q_z",
         "# Image Name,pos_x,pos_y,pos_z,rot_w,rot_x,rot_y,rot_z,note",
+        "# poses of Tuesday, in metres\nphoto\tpx\tpy\tpz\tqw\tqx\tqy\tqz\n# the first lap",
     ],
 )
 def test_a_table_of_positions_and_quaternions_is_read_by_its_head(tmp_path, head):
@@ -67,7 +68,7 @@ def test_a_table_of_positions_and_quaternions_is_read_by_its_head(tmp_path, head
     for index, pose in enumerate(POSES):
         x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
         values = [f"{index}.png", *map(repr, [*pose[:3, 3].tolist(), w, x, y, z])]
-        lines.append((";" if ";" in head else ",").join(values))
+        lines.append(max(",;\t", key=head.count).join(values))
         write_image(tmp_path / f"images/{index}.png", index)
     (tmp_path / "table.csv").write_text("\n".join(lines))
     dataset = read_dataset(tmp_path)
