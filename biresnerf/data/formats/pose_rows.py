@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 
 from biresnerf.data.formats.bad_frames import attempt
 from biresnerf.data.formats.bind_images import in_order
-from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, rigid_pose
+from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, listed_name, rigid_pose
 from biresnerf.data.formats.parsed_poses import Assignment, FrameCamera, LensOf, ParsedPoses, PoseEntry
 from biresnerf.data.model.colmap_scene import matrix_of_pose
 from biresnerf.data.model.conventions import OPENCV_FROM_OPENGL
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.pose_validation import rigid_matrix
+from biresnerf.data.model.untrusted_file import invalid_file
 from biresnerf.data.photos.image_files import ImageHeader
 from biresnerf.data.photos.photo_folders import images_in
 from biresnerf.errors import InputError
@@ -63,8 +64,7 @@ def parsed_rows(
     """
     rows = list(rows)
     if len(rows) > MAX_ROWS:
-        hint = "Split the set."
-        raise InputError("pose_file_invalid", f"more than {MAX_ROWS} poses.", where=files[0].name, hint=hint)
+        raise invalid_file(files[0].name, f"more than {MAX_ROWS} poses.", "Split the set.")
     entries = tuple(entry_of(name, where, partial(read, value, where)) for name, where, value in rows)
     twice = [name for name, count in Counter(entry.name for entry in entries).items() if count > 1]
     if twice:
@@ -85,6 +85,22 @@ def parsed_rows(
         take_file_names=take_file_names,
         photo_folders=tuple(photo_folders),
     )
+
+
+def named_rows(values: list[Any], place: str, key: str, hint: str) -> list[Row]:
+    """A list's objects with the names of images that they have under a key; `parsed_rows` reads the rest.
+
+    Raises:
+        InputError: ``pose_file_invalid`` for one without a name, ``unsafe_path``.
+    """
+    rows: list[Row] = []
+    for index, value in enumerate(values):
+        where = f"{place}[{index}]"
+        name = value.get(key) if isinstance(value, dict) else None
+        if not isinstance(name, str):
+            raise invalid_file(where, f"has no {key}.", hint)
+        rows.append((listed_name(name, f"{where}.{key}"), where, value))
+    return rows
 
 
 def entry_of(name: str, where: str, read: Callable[[], Placed]) -> PoseEntry:

@@ -26,12 +26,13 @@ import numpy as np
 from pydantic import BaseModel
 
 from biresnerf.data.formats.codec import Codec, head_holds
-from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, image_name, listed_name
+from biresnerf.data.formats.colmap.model_checks import camera_of_numbers
 from biresnerf.data.formats.parsed_poses import ParsedPoses
 from biresnerf.data.formats.pose_rows import (
     Placed,
     Row,
     at_size_of,
+    named_rows,
     parsed_rows,
     pinhole_of,
     pose_by,
@@ -160,10 +161,6 @@ class _Size(BaseModel):
     height: int
 
 
-class _SdfFrameName(BaseModel):
-    rgb_path: str
-
-
 class _SdfFrame(BaseModel, allow_inf_nan=False):
     camtoworld: list[list[float]]
     intrinsics: list[list[float]]
@@ -188,16 +185,8 @@ def parse_sdfstudio(_root: Path, file: Path) -> ParsedPoses:
         lens = pinhole_of(matrix, f"{where}.intrinsics", 0.5)(size.width, size.height)
         return pose_by(SDFSTUDIO, frame.camtoworld, f"{where}.camtoworld"), lens
 
-    rows: list[Row] = []
-    for index, value in enumerate(frames):
-        where = f"{file.name} frames[{index}]"
-        name = checked(_SdfFrameName, value, where, _SDFSTUDIO_HINT).rgb_path
-        rows.append((listed_name(name, f"{where}.rgb_path"), where, value))
+    rows = named_rows(frames, f"{file.name} frames", "rgb_path", _SDFSTUDIO_HINT)
     return parsed_rows(SDFSTUDIO, [file], rows, read)
-
-
-class _SplattingName(BaseModel):
-    img_name: str
 
 
 class _SplattingCamera(BaseModel, allow_inf_nan=False):
@@ -220,11 +209,7 @@ def parse_gaussian_splatting(_root: Path, file: Path) -> ParsedPoses:
     document = read_json(file)
     if not isinstance(document, list):
         raise invalid_file(file.name, "is no list of cameras.", _3DGS_HINT)
-    rows: list[Row] = []
-    for index, value in enumerate(document):
-        where = f"{file.name} [{index}]"
-        name = checked(_SplattingName, value, where, _3DGS_HINT).img_name
-        rows.append((image_name(name, f"{where}.img_name"), where, value))
+    rows = named_rows(document, f"{file.name} ", "img_name", _3DGS_HINT)
     return parsed_rows(GAUSSIAN_SPLATTING, [file], rows, _read_splatting)
 
 

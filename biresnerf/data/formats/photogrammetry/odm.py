@@ -13,10 +13,9 @@ import numpy as np
 from pydantic import BaseModel
 
 from biresnerf.data.formats.codec import Codec, head_holds
-from biresnerf.data.formats.colmap.model_checks import image_name
 from biresnerf.data.formats.parsed_poses import LensOf, ParsedPoses
 from biresnerf.data.formats.photogrammetry.opensfm import read_lens, world_from_cam_of_vector
-from biresnerf.data.formats.pose_rows import Placed, Row, folder_with_photos, parsed_rows
+from biresnerf.data.formats.pose_rows import Placed, folder_with_photos, named_rows, parsed_rows
 from biresnerf.data.model.untrusted_file import checked, invalid_file, read_json_object
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.options.formats import Format
@@ -36,7 +35,6 @@ _Vector: TypeAlias = tuple[float, float, float]
 
 
 class _Shot(BaseModel, allow_inf_nan=False):
-    filename: str
     rotation: _Vector
     translation: _Vector
     focal: float = 0.0
@@ -56,18 +54,16 @@ def parse_odm(root: Path, file: Path) -> ParsedPoses:
     lens_files = [path for path in (root / _LENSES, file.parent.parent / _LENSES) if path.is_file()][:1]
     shared = _shared_lens(lens_files[0]) if lens_files else None
 
-    def read(shot: _Shot, where: str) -> Placed:
+    def read(value: Any, where: str) -> Placed:
+        shot = checked(_Shot, value, where, _HINT)
         pose = world_from_cam_of_vector(shot.rotation, (0.0, 0.0, 0.0), where)
         pose[:3, 3] = shot.translation
         if shared is not None or not shot.focal:
             return np.asarray(pose), shared
         return np.asarray(pose), read_lens(shot.model_dump(include={"focal", "width", "height"}), where)
 
-    rows: list[Row] = []
-    for index, feature in enumerate(features):
-        where = f"{file.name} features[{index}]"
-        shot = checked(_Shot, feature.get("properties") if isinstance(feature, dict) else None, where, _HINT)
-        rows.append((image_name(shot.filename, where), where, shot))
+    shots = [one.get("properties") if isinstance(one, dict) else None for one in features]
+    rows = named_rows(shots, f"{file.name} features", "filename", _HINT)
     return parsed_rows(ODM, [file, *lens_files], rows, read)
 
 

@@ -74,9 +74,18 @@ def test_a_bad_file_is_named(tmp_path, change, where):
     change(document)
     file.write_text(json.dumps(document))
     with pytest.raises(InputError) as caught:
-        read_dataset(file)
+        read_dataset(file, strict=True)
     code = "duplicate_image" if len(document["features"]) == 5 else "pose_file_invalid"
     assert_complete(caught.value, code, where)
+
+
+def test_a_bad_shot_costs_one_image_its_pose(tmp_path):
+    project(tmp_path)
+    file = tmp_path / "odm_report/shots.geojson"
+    document = json.loads(file.read_text())
+    document["features"][1]["properties"]["rotation"] = [1]
+    file.write_text(json.dumps(document))
+    assert read_dataset(file).posed.tolist() == [True, False, True, True]
 
 
 def test_a_real_project_looks_down_from_its_flight(tmp_path):
