@@ -44,6 +44,16 @@ def read_text(path: Path, most_bytes: int = MAX_TEXT_BYTES) -> str:
         raise invalid_file(path.name, "is not UTF-8 text.", hint) from None
 
 
+def read_words(path: Path) -> list[tuple[str, list[str]]]:
+    """The place of each line that says something, and its words; lines that begin with # say nothing.
+
+    Raises:
+        InputError: as `read_text` does.
+    """
+    lines = ((number, line.split()) for number, line in enumerate(read_text(path).splitlines(), start=1))
+    return [(f"{path.name} line {n}", words) for n, words in lines if words and not words[0].startswith("#")]
+
+
 def finite_numbers(words: Sequence[str], where: str, hint: str, *counts: int) -> NDArray[np.float64]:
     """The numbers that ``words`` stand for, as many as one of ``counts`` where these are given.
 

@@ -22,7 +22,7 @@ from biresnerf.data.formats.bind_images import in_order
 from biresnerf.data.formats.codec import Codec, head_matches
 from biresnerf.data.formats.parsed_poses import Assignment, ParsedPoses
 from biresnerf.data.formats.pose_rows import Placed, at_size_of, lens_of, parsed_rows, pose_by
-from biresnerf.data.model.untrusted_file import finite_numbers, invalid_file, read_text
+from biresnerf.data.model.untrusted_file import finite_numbers, invalid_file, read_words
 from biresnerf.geometry.camera.camera_models import Camera, FullParameters
 from biresnerf.options.formats import Format
 
@@ -52,20 +52,14 @@ _BLOCK = rb"(?i)\s*\d+\s+-?\d+\s+\S+[ \t]*\r?\n\s*([-+]?[\d.]+(e[-+]?\d+)?\s+){4
 _BLOCK_HINT = "Give five lines an image: two numbers and an error, then 4 rows of 4 numbers, camera to world."
 
 
-def _lines(file: Path) -> list[tuple[str, _Words]]:
-    """The place of each line that says something, and its words."""
-    lines = enumerate(read_text(file).splitlines(), start=1)
-    return [(f"{file.name} line {number}", line.split()) for number, line in lines if line.strip()]
-
-
 def parse_realestate10k(_root: Path, file: Path) -> ParsedPoses:
     """The cameras of ``file``, called by their times.
 
     Raises:
         InputError: codes as in docs/input.md.
     """
-    lines = [(where, words) for where, words in _lines(file) if not words[0].startswith(("http", "#"))]
-    rows = [(words[0], where, words) for where, words in lines]
+    lines = read_words(file)
+    rows = [(words[0], where, words) for where, words in lines if not words[0].startswith("http")]
     parsed = parsed_rows(REALESTATE10K, [file], rows, _read_line, photo_folders=("frames",))
     by_time = {entry.name: entry for entry in parsed.entries}
 
@@ -94,7 +88,7 @@ def parse_tanks_and_temples(_root: Path, file: Path) -> ParsedPoses:
     Raises:
         InputError: codes as in docs/input.md.
     """
-    lines = _lines(file)
+    lines = read_words(file)
     if len(lines) % 5:
         raise invalid_file(file.name, f"has {len(lines)} lines, not five an image.", _BLOCK_HINT)
     rows = [

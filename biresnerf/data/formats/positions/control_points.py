@@ -12,10 +12,10 @@ import numpy as np
 
 from biresnerf.data.formats.match_names import match_files
 from biresnerf.data.formats.positions.markers import is_marker, marked, refuse_without_opencv
-from biresnerf.data.formats.positions.position_table import WGS84, frame_of
+from biresnerf.data.formats.positions.position_table import WGS84, files_called, frame_of
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.measured_places import ControlPoints
-from biresnerf.data.model.untrusted_file import read_table, read_text
+from biresnerf.data.model.untrusted_file import read_table, read_text, read_words
 from biresnerf.data.photos.panoramas.cut_panoramas import place_in_view
 from biresnerf.errors import InputError
 from biresnerf.geometry.earth.geodesy import east_north_up
@@ -48,8 +48,7 @@ class _Row:
 
 def control_files(root: Path) -> list[Path]:
     """The files in the folder ``root`` that are called as lists of control points, the preferred one first."""
-    files = {path.name.lower(): path for path in sorted(root.iterdir()) if path.is_file()}
-    return [files[name] for name in CONTROL_FILES if name in files]
+    return files_called(root, CONTROL_FILES)
 
 
 def control_points(dataset: Dataset) -> ControlPoints | None:
@@ -129,16 +128,13 @@ def _rows_of(file: Path) -> tuple[list[_Row], bool, int | None]:
 
 def _of_odm(file: Path) -> tuple[list[_Row], bool, int | None]:
     """OpenDroneMap's: a frame, then x (or longitude), y, z, the pixel, the photo, and perhaps a name."""
-    lines = [(n, line.split()) for n, line in enumerate(read_text(file).splitlines(), 1) if line.strip()]
+    lines = read_words(file)
     if not lines:
         raise _invalid(file.name, "is empty.")
     (header, frame), *told = lines
-    told = [(number, cells) for number, cells in told if not cells[0].startswith("#")]
-    coordinates = [("", *cells) for _, cells in told]
-    degrees, metres, epsg = frame_of(" ".join(frame), coordinates, f"{file.name} line {header}")
+    degrees, metres, epsg = frame_of(" ".join(frame), [cells for _, cells in told], header)
     rows, unknown = [], (math.nan,) * 3
-    for number, cells in told:
-        where = f"{file.name} line {number}"
+    for where, cells in told:
         if len(cells) < 6:
             raise _invalid(where, "has less than x y z px py and an image.")
         x, y, z, px, py = _numbers(cells[:5], where)

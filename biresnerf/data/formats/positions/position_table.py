@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from biresnerf.data.model.untrusted_file import read_table, read_text
+from biresnerf.data.model.untrusted_file import read_table, read_text, read_words
 from biresnerf.data.photos.geotags import MeasuredPlace
 from biresnerf.errors import InputError
 
@@ -57,10 +57,15 @@ class PositionTable:
     notes: tuple[str, ...] = ()
 
 
-def position_files(root: Path) -> list[Path]:
-    """The files in the folder ``root`` that are called as tables of positions, the preferred one first."""
+def files_called(root: Path, names: Sequence[str]) -> list[Path]:
+    """The files in the folder ``root`` that are called so, whatever their case, in this order."""
     files = {path.name.lower(): path for path in sorted(root.iterdir()) if path.is_file()}
-    return [files[name] for name in POSITION_FILES if name in files]
+    return [files[name] for name in names if name in files]
+
+
+def position_files(root: Path) -> list[Path]:
+    """Those that are called as tables of positions."""
+    return files_called(root, POSITION_FILES)
 
 
 def is_geographic(frame: str) -> bool:
@@ -77,7 +82,7 @@ def read_position_table(file: Path) -> PositionTable:
     lines = read_text(file).splitlines()
     blank = next((index for index, line in enumerate(lines) if line.strip()), 0)
     if lines and re.match(r"\s*(EPSG:|WGS84 UTM|'?\+proj)", lines[blank], re.I):
-        return _geo_txt(file.name, lines, blank)
+        return _geo_txt(file)
     said = next((line for line in lines if "coordinatesystem" in line.lower().replace(" ", "")), "")
     table = read_table(file.name, lines, _COLUMNS, _is_head)
     if table is None:
@@ -105,30 +110,24 @@ def read_position_table(file: Path) -> PositionTable:
     return PositionTable(file.name, places, degrees, epsg, _flat_notes(flat))
 
 
-def _geo_txt(source: str, lines: Sequence[str], first: int) -> PositionTable:
+def _geo_txt(file: Path) -> PositionTable:
     """OpenDroneMap's: a frame, then names, x (or longitude), y (or latitude), perhaps height, angles and accuracies."""
-    rows: dict[str, list[str]] = {}
-    flat: list[str] = []
-    for number, line in enumerate(lines[first + 1 :], first + 2):
-        cells, where = line.split(), f"{source} line {number}"
-        if not cells or cells[0].startswith("#"):
-            continue
+    (header, frame), *told = read_words(file)
+    for where, cells in told:
         if len(cells) < 3:
             raise _invalid(where, "has less than a name and two numbers.")
-        if len(cells) == 3:
-            flat.append(where)
-        else:
-            rows[where] = cells
-    degrees, metres, epsg = frame_of(lines[first], list(rows.values()), f"{source} line {first + 1}")
+    flat = [where for where, cells in told if len(cells) == 3]
+    rows = [(where, cells) for where, cells in told if len(cells) > 3]
+    degrees, metres, epsg = frame_of(" ".join(frame), [cells[1:] for _, cells in rows], header)
     places: dict[str, MeasuredPlace] = {}
-    for where, cells in rows.items():
+    for where, cells in rows:
         x, y, z = cells[1:4]
         texts = [y, x, z] if degrees else [x, y, z]
         stated = cells[_ODM_ACCURACY : _ODM_ACCURACY + 2]
         _add(places, cells[0], texts, stated, where, degrees=degrees)
         a, b, c = places[cells[0]].place
         places[cells[0]] = places[cells[0]]._replace(place=(a * metres, b * metres, c))
-    return PositionTable(source, places, degrees, epsg, _flat_notes(flat))
+    return PositionTable(file.name, places, degrees, epsg, _flat_notes(flat))
 
 
 def _flat_notes(places: Sequence[str]) -> tuple[str, ...]:
@@ -147,7 +146,7 @@ def frame_of(header: str, rows: Sequence[Sequence[str]], where: str) -> tuple[bo
         number = int(found[1])
         if number in _DEGREES:
             return True, 1.0, WGS84 if number == 4326 else number
-        small = all(abs(value) <= 180 for cells in rows for value in map(_number, cells[1:3]))
+        small = all(abs(value) <= 180 for cells in rows for value in map(_number, cells[:2]))
         return small and not any(number in some for some in _PROJECTED), 1.0, number
     if found := re.fullmatch(r"\s*WGS84 UTM (\d{1,2})([NS])\s*", header, re.I):
         return False, 1.0, int(found[1]) + (32700 if found[2] in "Ss" else 32600)

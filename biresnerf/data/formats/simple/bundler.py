@@ -18,7 +18,7 @@ from biresnerf.data.formats.parsed_poses import ParsedPoses
 from biresnerf.data.formats.pose_rows import Placed, at_size_of, parsed_rows, pose_by
 from biresnerf.data.model.atomic_file import write_text
 from biresnerf.data.model.refined_set import RefinedSet
-from biresnerf.data.model.untrusted_file import finite_numbers, invalid_file, read_text
+from biresnerf.data.model.untrusted_file import finite_numbers, invalid_file, read_text, read_words
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.options.formats import Format
@@ -73,9 +73,7 @@ def parse_bundler(root: Path, file: Path) -> ParsedPoses:
 
 def _blocks(file: Path) -> list[list[list[str]]]:
     """The words of the lines of each camera. Raises InputError ``pose_file_invalid``."""
-    lines = [
-        line.split() for line in read_text(file).splitlines() if line.strip() and not line.startswith("#")
-    ]
+    lines = [words for _, words in read_words(file)]
     counts = _numbers(lines[:1], 1, 2, f"{file.name} first line")[0]
     if not all(count == round(count) and count >= 0 for count in counts):
         raise invalid_file(
