@@ -34,8 +34,8 @@ from biresnerf.refinement.adjustment.evidence import Evidence, NoiseLevels, Patc
 from biresnerf.refinement.adjustment.patch_points import Surfaces, find_patches
 from biresnerf.refinement.kernels.batch_errors import add_errors
 from biresnerf.refinement.kernels.draw_pixels import draw_pixels
-from biresnerf.refinement.optimise.cast_rays import cast_rays, viewing_directions
 from biresnerf.refinement.optimise.pixel_chances import PixelChances
+from biresnerf.refinement.optimise.renderer import cast_rays, viewing_directions
 from biresnerf.refinement.parameters.pose_parameters import PoseParameters
 
 SIZE, BASELINE = 32, 0.125  # px, and as a share of the distance to the scene: four pixels

@@ -53,6 +53,7 @@ from biresnerf.refinement.views.held_out_views import held_out_views
 from biresnerf.report import Report
 from biresnerf.resume import earlier_work, refuse_other_run, reusable_seeding, run_origin
 from biresnerf.stages import Stage
+from biresnerf.uncertainty import PoseUncertainty
 from biresnerf.write.output_folder import OutputFolder
 from biresnerf.write.preview import SeedingPreview, write_preview
 from biresnerf.write.result import ResultPictures, write_result
@@ -137,7 +138,10 @@ def _refine(input: str | Path | Dataset, setup: _Setup, observer: Observer, star
         if judgement is not None:
             shown = pictures.write_before_after(evaluation.views, judgement.renders)
             evaluation = replace(evaluation, views=shown)
-        known = pose_uncertainty(scene.dataset, optimiser, finish, judgement)
+        known: tuple[PoseUncertainty, ...] = ()
+        if optimiser.method.uncertainty:
+            lost = optimiser.camera_errors.lost.cpu().numpy()
+            known = pose_uncertainty(scene.dataset, optimiser.joint, finish, judgement, lost)
         found = Findings(evaluation.scores, judgement, finish, known)
         report = run_report(scene, optimiser, run.record, repair.repaired, found)
         report = write_result(setup.folder, scene, optimiser, setup.monitor, evaluation, report)

@@ -27,7 +27,7 @@ from biresnerf.field.cuda.cameras import poses_and_rays
 from biresnerf.field.occupancy import DeviceOccupancyGrid
 from biresnerf.field.radiance_field import Marching, PositionGradient, Rays, Rendering
 from biresnerf.geometry.camera.camera import Intrinsics
-from biresnerf.refinement.optimise import cast_rays
+from biresnerf.refinement.optimise import renderer
 from biresnerf.refinement.optimise.joint_optimiser import OCCUPANCY_PERIOD, JointOptimiser
 from biresnerf.refinement.parameters import pose_parameters
 
@@ -125,7 +125,7 @@ def traced_step(optimiser: JointOptimiser, *, looks_at_cells: bool = False) -> T
 
     with (
         patch.object(pose_parameters, "camera_kernels", lambda device: poses_and_rays),
-        patch.object(cast_rays, "camera_kernels", lambda device: poses_and_rays),
+        patch.object(renderer, "camera_kernels", lambda device: poses_and_rays),
         patch.object(poses_and_rays, "_launch", launch),
         patch.object(torch, "rand", lambda *size, generator=None, **where: rand(*size, **where)),
         patch.object(torch, "randint", lambda *size, generator=None, **where: randint(*size, **where)),

@@ -73,10 +73,9 @@ def relative(ours: Tensor, theirs: Tensor) -> float:
 def ours(optimiser: JointOptimiser, image: Tensor, xy: Tensor, photo: Tensor) -> dict[str, Tensor]:
     """Colours [rays, 3] and gradients of the loss, of samples in the middles of their bins."""
     matrices = optimiser.poses.matrices()[image]
-    origin, direction = optimiser.cast(matrices, image, xy)
-    colour = optimiser.render(
-        origin, direction, len(xy), optimiser.schedule.fine_interval, PositionGradient(), jitter=False
-    ).colour
+    renderer = optimiser.renderer
+    rays = renderer.over_background(*renderer.cast(matrices, image, xy), len(xy), jitter=False)
+    colour = renderer.field.render(rays, renderer.marching, PositionGradient()).colour
     optimiser.method.loss(colour, photo).mean().backward()
     poses = optimiser.poses
     assert isinstance(optimiser.field, MlpField)
@@ -112,7 +111,7 @@ def theirs(
     given = camera.pose(R=turn, t=-(turn @ start[:, :, 3:])[:, :, 0] / field.length)
     increments = torch.zeros(len(given), 6, requires_grad=True)
     poses = camera.pose.compose([camera.lie.se3_to_SE3(increments), given])
-    lens = optimiser.intrinsics
+    lens = optimiser.lenses.intrinsics
     matrix = torch.zeros(len(given), 3, 3)
     matrix[:, 0, 0], matrix[:, 1, 1], matrix[:, 2, 2] = lens.fx, lens.fy, 1.0
     matrix[:, 0, 2], matrix[:, 1, 2] = lens.cx, lens.cy

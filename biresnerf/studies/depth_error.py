@@ -10,7 +10,7 @@ from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.synthetic.captures import PHONE_FROM_SCENE, TABLE_METRES, TABLE_SCENE, VASE
 from biresnerf.data.synthetic.scene import MADE_SCENE, SHAPES, render_shapes
 from biresnerf.geometry.similarity import Similarity, align_robust
-from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.optimise.renderer import Renderer
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.views.evaluation import render_view
 
@@ -40,7 +40,7 @@ def true_distance(
     return world_from_scene.scale * depth * np.sqrt(1 + x**2 + y[:, None] ** 2)
 
 
-def depth_error(optimiser: JointOptimiser, scene: Scene, truth: NDArray[np.float64]) -> float | None:
+def depth_error(scene: Scene, renderer: Renderer, truth: NDArray[np.float64]) -> float | None:
     """Mean absolute relative error of the depth rendered at the true poses of held-out views.
 
     Mean of |z - z*| / z* over the pixels that show a surface (Eigen et al. 2014), then over the views. None where none
@@ -51,13 +51,13 @@ def depth_error(optimiser: JointOptimiser, scene: Scene, truth: NDArray[np.float
     """
     if not scene.held_out or not is_made(scene.dataset):
         return None
-    unit_from_true = align_robust(truth, optimiser.poses.poses().numpy())
+    unit_from_true = align_robust(truth, renderer.joint.unit_from_cam)
     errors = []
     for image in scene.held_out:
         camera = scene.images.cameras[image]
         true = true_distance(scene.dataset, truth[image], camera.width, camera.height, camera.full().fx)
         matrix = torch.from_numpy(unit_from_true.apply_to_poses(truth[image][None])[0, :3])
-        rendered = render_view(optimiser, matrix, image).depth / unit_from_true.scale
+        rendered = render_view(renderer, matrix, image).depth / unit_from_true.scale
         there = np.isfinite(true)
         errors.append(float((np.abs(rendered[there] - true[there]) / true[there]).mean()))
     return float(np.mean(errors))

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.images import load_images
-from biresnerf.field.radiance_field import PositionGradient
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.similarity import align_robust
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
@@ -58,8 +57,9 @@ def render_test_views(
         mask = images.counts_image(index)
         counts = None if mask is None else torch.from_numpy(mask)
         matrix = _fitted(optimiser, unit_from_cam[index], photo, counts, index, intrinsics)
-        colour = render_view(optimiser, matrix, index, intrinsics).colour
-        unshared = unshared_opacity(optimiser, matrix, index, intrinsics)
+        renderer, held_out = optimiser.renderer, optimiser.camera_errors.held_out
+        colour = render_view(renderer, matrix, index, intrinsics).colour
+        unshared = unshared_opacity(renderer, held_out, matrix, index, intrinsics)
         yield PhotoAndRender(photo, torch.from_numpy(colour), unshared, counts)
 
 
@@ -75,16 +75,13 @@ def _fitted(
     device = optimiser.device
     pose = PoseParameters(torch.from_numpy(unit_from_cam[None]), optimiser.poses.length, device)
     pixels = torch.nonzero(torch.ones(photo.shape[:2]) if counts is None else counts)
-    rays = fit_rays(optimiser)
+    rays, renderer = fit_rays(optimiser.method, optimiser.rays), optimiser.renderer
     which = torch.full((rays,), index, device=device)
     for step in range(FIT_STEPS):
         y, x = pixels[torch.randint(len(pixels), (rays,), generator=optimiser.generator)].T
         xy = torch.stack([x, y], 1).to(device) + 0.5
-        matrices = pose.matrices().expand(rays, 3, 4)
-        origin, direction = optimiser.cast(matrices, which, xy, intrinsics)
-        rendering = optimiser.render(
-            origin, direction, 0, optimiser.schedule.fine_interval, PositionGradient(), jitter=True
-        )
+        cast = renderer.cast(pose.matrices().expand(rays, 3, 4), which, xy, intrinsics)
+        rendering = renderer.render(*cast, jitter=True)
         optimiser.method.loss(rendering.colour, photo[y, x].to(device)).mean().backward()
         pose.step(FIT_RATE * 0.1 ** (step / FIT_STEPS))
     return pose.matrices().detach()[0]

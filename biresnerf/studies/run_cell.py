@@ -86,7 +86,7 @@ class TruthObserver:
         matched = scene.start.matched_poses
         if matched is not None:
             self.matched = matched_error(matched, scene.dataset.world_from_cam, self.truth)
-        self.depth_error = depth_error(optimiser, scene, self.truth)
+        self.depth_error = depth_error(scene, optimiser.renderer, self.truth)
         if self.test_views is None:
             return
         started = time.monotonic()

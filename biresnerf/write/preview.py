@@ -21,6 +21,7 @@ from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.progress import Monitor, Progress
 from biresnerf.refinement.lost.lost_cameras import LostCameraRepair
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.optimise.renderer import Renderer
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.run_state import RunState
 from biresnerf.refinement.verdict.run_report import Findings, run_report
@@ -50,19 +51,21 @@ def write_preview(
     if run.history.path.is_file():
         write_text(path / HISTORY, run.history.path.read_text("utf-8").rstrip("\n"))
         names.append(HISTORY)
-    return tuple(f"{PREVIEW}/{name}" for name in (*names, *_write_pictures(folder, scene, optimiser)))
+    return tuple(
+        f"{PREVIEW}/{name}" for name in (*names, *_write_pictures(folder, scene, optimiser.renderer))
+    )
 
 
-def _write_pictures(folder: OutputFolder, scene: Scene, optimiser: JointOptimiser) -> list[str]:
+def _write_pictures(folder: OutputFolder, scene: Scene, renderer: Renderer) -> list[str]:
     """Names of the pictures of one view, held out where there is one, and of its thumbnail."""
     view = (scene.held_out or [0])[0]
     halves = [
         camera.resized(max(1, camera.width // 2), max(1, camera.height // 2))
-        for camera in optimiser.lenses.refined_working(scene.images.cameras)
+        for camera in renderer.joint.lenses.refined_working(scene.images.cameras)
     ]
-    intrinsics = Intrinsics.from_cameras(halves).to(optimiser.device)
-    pose = optimiser.poses.matrices()[view].detach()
-    rendered = render_view(optimiser, pose, view, intrinsics, as_photo=True)
+    intrinsics = Intrinsics.from_cameras(halves).to(renderer.device)
+    pose = renderer.joint.poses.matrices()[view].detach()
+    rendered = render_view(renderer, pose, view, intrinsics, as_photo=True)
     photo = scene.images.image(view)
     small = area_resize(photo, halves[view].width, halves[view].height) / 255
     pictures = write_rendered(folder.preview, picture_stems(scene.dataset.names)[view], rendered, small)

@@ -69,7 +69,7 @@ def write_result(
         monitor.report(Progress(stage="exporting"))
     path = folder.path
     write_text(path / CONFIG, optimiser.options.model_dump_json(indent=2))
-    found = so_far.refined if so_far is not None else RefinedPoses.now(scene.dataset, optimiser)
+    found = so_far.refined if so_far is not None else RefinedPoses.now(scene.dataset, optimiser.joint)
     refined, refined_dataset = found.world_from_cam, found.dataset
     surface = evaluation.surface(optimiser.frame.unit_from_world, found.input_from_optimised)
     field = FieldPoints(*surface, refined) if np.isfinite(refined).all() else None

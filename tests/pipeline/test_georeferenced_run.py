@@ -59,9 +59,9 @@ def test_where_nobody_gave_poses_the_result_lies_where_it_was_measured(tmp_path)
     positions = PositionPriors("EXIF", rows, 1.007 * places, np.full((8, 3), 0.01), None, None)
     dataset = replace(given, frames=frames, positions=positions)
     optimiser = tiny_optimiser(dataset, load_images(dataset, 24), tiny_options())
-    found = RefinedPoses.now(dataset, optimiser).world_from_cam
+    found = RefinedPoses.now(dataset, optimiser.joint).world_from_cam
     np.testing.assert_allclose(found[:, :3, 3], 1.007 * places, atol=1e-6)
-    given = RefinedPoses.now(replace(given, positions=positions), optimiser).world_from_cam
+    given = RefinedPoses.now(replace(given, positions=positions), optimiser.joint).world_from_cam
     np.testing.assert_allclose(given[:, :3, 3], places, atol=1e-6)
 
 

@@ -74,10 +74,10 @@ def test_the_true_surfaces_have_next_to_no_error_and_fog_has(made):
     dataset, images, optimiser = made
     scene, truth = given_scene(dataset, images, held_out=[3]), dataset.world_from_cam
     optimiser.field = surfaces(made)
-    exact = depth_error(optimiser, scene, truth)
+    exact = depth_error(scene, optimiser.renderer, truth)
     optimiser.field = surfaces(made, fog=1.0)
     assert exact < 0.02  # an interval of marching, and pixels at outlines
-    assert depth_error(optimiser, scene, truth) > 0.1
+    assert depth_error(scene, optimiser.renderer, truth) > 0.1
 
 
 def test_an_empty_field_is_wholly_wrong(made):
@@ -85,10 +85,10 @@ def test_an_empty_field_is_wholly_wrong(made):
     scene = given_scene(dataset, images, held_out=[3])
     optimiser.field = AnalyticField(lambda points: torch.zeros(len(points)), unbounded=False)
     assert (
-        depth_error(optimiser, scene, dataset.world_from_cam) == 1.0
+        depth_error(scene, optimiser.renderer, dataset.world_from_cam) == 1.0
     )  # nothing is rendered: as far off as can be
 
 
 def test_there_is_none_without_held_out_views(made):
     dataset, images, optimiser = made
-    assert depth_error(optimiser, given_scene(dataset, images), dataset.world_from_cam) is None
+    assert depth_error(given_scene(dataset, images), optimiser.renderer, dataset.world_from_cam) is None

@@ -34,7 +34,7 @@ def trained(tmp_path_factory):
 def test_a_view_at_a_training_cameras_true_pose_is_what_that_camera_sees(trained, monkeypatch):
     monkeypatch.setattr(novel_views, "FIT_STEPS", 0)
     optimiser, dataset = trained
-    expected = render_view(optimiser, optimiser.poses.matrices().detach()[2], 2).colour
+    expected = render_view(optimiser.renderer, optimiser.poses.matrices().detach()[2], 2).colour
     pairs = list(render_test_views(optimiser, dataset, dataset.world_from_cam))
     np.testing.assert_allclose(pairs[2].render.numpy(), expected, atol=1e-3)
     assert expected.std() > 0.02  # not an even picture, which would be the same from anywhere

@@ -8,6 +8,7 @@ import torch
 
 from biresnerf.refinement.finish.candidates import BY_PATCHES
 from biresnerf.refinement.finish.choose_poses import choose_poses
+from biresnerf.refinement.finish.gather_evidence import gather_evidence
 from biresnerf.refinement.finish.lens_evidence import corrected_cameras
 from biresnerf.refinement.finish.outcome import Finish
 from biresnerf.refinement.finish.photo_trial import photos_object
@@ -48,7 +49,9 @@ def adjust_cameras(
     with run.timed("adjusting", amount=adjustment(scene)):
         if moves:
             repair.place_by_matches()
-        found = choose_poses(scene, optimiser, announce)
+        placed = ~optimiser.camera_errors.doubted.cpu().numpy()
+        gathered = gather_evidence(scene, optimiser.renderer, optimiser.options, placed)
+        found = choose_poses(scene, optimiser.joint, gathered, optimiser.options, announce)
     if found is None:
         return Finish()
     chosen, finish, focals = found
@@ -62,7 +65,7 @@ def adjust_cameras(
         cameras = corrected_cameras(cameras, lenses.correction) or cameras
     asked = chosen.name not in ("refined", *BY_PATCHES)
     rig = Rig(chosen.world_from_cam, tuple(cameras[frame.camera] for frame in scene.dataset.frames))
-    if asked and photos_object(scene, optimiser, run, rig):
+    if asked and photos_object(scene, optimiser.joint, optimiser.recipe, run, rig):
         logger.info("the photos contradict these poses, which are not taken")
         optimiser.lenses.be_certain(certainty)
         return finish.refused()

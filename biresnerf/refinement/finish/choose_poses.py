@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.rigid_bodies import RigidBodies
+from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refinement.adjustment.adjustment import NOTHING_FITS, Adjustment, adjust_poses, misfit
 from biresnerf.refinement.adjustment.cameras import Cameras
 from biresnerf.refinement.adjustment.choice import Candidate, Choice, choose
@@ -28,13 +29,13 @@ from biresnerf.refinement.finish.candidates import (
     without_adjustment,
 )
 from biresnerf.refinement.finish.expected_errors import expected_errors
-from biresnerf.refinement.finish.gather_evidence import SplitEvidence, gather_evidence
+from biresnerf.refinement.finish.gather_evidence import SplitEvidence
 from biresnerf.refinement.finish.given_poses import input_accuracy
 from biresnerf.refinement.finish.lens_evidence import contradicted_focals, focal_certainty, given_focals
 from biresnerf.refinement.finish.lens_model import simple_lenses, supported_lenses
 from biresnerf.refinement.finish.outcome import Finish, fit_of, heeded, most_heeded
-from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.parameters.intrinsics_parameters import FocalCertainty
+from biresnerf.refinement.parameters.joint_parameters import JointParameters
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.report import CandidateName
 
@@ -54,41 +55,44 @@ TOLD_APART = 2.0
 
 
 def choose_poses(
-    scene: Scene, optimiser: JointOptimiser, announce: Callable[[], None]
+    scene: Scene,
+    joint: JointParameters,
+    gathered: SplitEvidence,
+    options: ResolvedOptions,
+    announce: Callable[[], None],
 ) -> tuple[Candidate, Finish, tuple[FocalCertainty | None, ...]] | None:
     """The best candidate, in the unit frame, how it was found, and what is known of each camera's focal length.
 
     None where no evidence can tell.
     """
-    gathered = gather_evidence(scene, optimiser)
-    refined = optimiser.poses.poses().numpy()
+    refined = joint.unit_from_cam
     if not np.isfinite(refined).all():
         return None
-    cameras = optimiser.lenses.refined(scene.dataset).cameras
-    split, prior, results = _adjusted(gathered, refined, optimiser, cameras, announce)
+    cameras = joint.lenses.refined(scene.dataset).cameras
+    split, prior, results = _adjusted(gathered, refined, joint, cameras, announce)
     heeding = most_heeded(results)
     if heeding is not None and not _believes_control(heeding, split.fitted):
         logger.info("control points are not believed: too many contradict the photos")
-        split, prior, results = _adjusted(gathered.without_control(), refined, optimiser, cameras, announce)
+        split, prior, results = _adjusted(gathered.without_control(), refined, joint, cameras, announce)
     noise = results["adjusted-tracks"].noise if "adjusted-tracks" in results else NoiseLevels()
     if noise.track_px > _most_noise_px(split.fitted):
         logger.info("tracks say nothing: their noise is %.1f px", noise.track_px)
         split = split.without_tracks()
         results = {name: each for name, each in results.items() if name == "adjusted-patches"}
-    given = input_accuracy(scene.dataset, most_heeded(results), split.fitted, optimiser.options)
+    given = input_accuracy(scene.dataset, most_heeded(results), split.fitted, options)
     if given is not None and given.tells(prior):
         prior = given.prior(prior)
         patched = results.get("adjusted-patches")
         results = adjust(refined, split.fitted, prior, announce, patched.halves if patched else None)
     adjusted = [as_candidate(name, each, split.fitted, cameras) for name, each in results.items()]
-    found = [Candidate("refined", refined), *without_adjustment(scene, refined, optimiser.bodies)]
+    found = [Candidate("refined", refined), *without_adjustment(scene, refined, joint.bodies)]
     candidates = sorted([*found, *filter(None, adjusted)], key=lambda candidate: ORDER.index(candidate.name))
     # Fixed cameras are the same in all candidates: theirs tell only whose points fit them.
     misfits = _misfits(candidates, split, noise, ~prior.fixed & split.placed, announce)
     if not misfits:
         return None
     by_tracks = results.get("adjusted-tracks")
-    alike = {} if by_tracks is None else {"tracks": _within(candidates, by_tracks, split, optimiser.bodies)}
+    alike = {} if by_tracks is None else {"tracks": _within(candidates, by_tracks, split, joint.bodies)}
     rigs = [(Cameras.of(c.world_from_cam, c.lenses), split.fitted) for c in candidates]
     for kind, (misfit_to, as_well) in measured_misfits(rigs).items():
         misfits[kind], alike[kind] = misfit_to, as_well
@@ -104,7 +108,7 @@ def choose_poses(
         results[chosen.name] = result
         chosen = as_candidate(chosen.name, result, heeded_now, cameras) or chosen
     best = results.get(chosen.name) or next(iter(results.values()), None)
-    kept = given_focals(scene.dataset, optimiser.options.refine_intrinsics)
+    kept = given_focals(scene.dataset, options.refine_intrinsics)
     focals = focal_certainty(
         best,
         split.fitted,
@@ -116,14 +120,14 @@ def choose_poses(
 def _adjusted(
     split: SplitEvidence,
     refined: Array,
-    optimiser: JointOptimiser,
+    joint: JointParameters,
     cameras: Sequence[Camera],
     announce: Callable[[], None],
 ) -> tuple[SplitEvidence, PosePrior, dict[CandidateName, Adjustment]]:
     """The evidence with the lenses that it supports, what is known before, and the poses adjusted to both."""
     loose = np.full(len(refined), PRIOR)
     loose[split.fitted.held_by_measurements] = NOTHING_KNOWN  # a prior would hold a bend of all cameras
-    prior = PosePrior(refined, loose, loose * optimiser.frame.distance, optimiser.bodies)
+    prior = PosePrior(refined, loose, loose * joint.frame.distance, joint.bodies)
     lenses = supported_lenses(refined, split.fitted, split.left_out, prior, cameras, announce)
     split = replace(split, fitted=replace(split.fitted, lenses=lenses))
     return split, prior, adjust(refined, split.fitted, prior, announce)

@@ -13,11 +13,13 @@ from biresnerf.data.points.located_points import located
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.earth.georeference import NoGeoreference, fit_positions
+from biresnerf.options.refine_options import RefineIntrinsics, ResolvedOptions
 from biresnerf.refinement.adjustment.evidence import Control, Evidence, Positions
 from biresnerf.refinement.adjustment.ideal import ideal_cameras, straight_tracks
 from biresnerf.refinement.finish.lens_evidence import lenses_before
 from biresnerf.refinement.finish.photo_evidence import photo_patches
-from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.optimise.renderer import Renderer
+from biresnerf.refinement.parameters.joint_parameters import JointParameters
 from biresnerf.refinement.scene.scene import Scene
 
 Array = NDArray[np.float64]
@@ -50,11 +52,13 @@ class SplitEvidence:
         return SplitEvidence(fitted, left_out, None, self.placed)
 
 
-def gather_evidence(scene: Scene, optimiser: JointOptimiser) -> SplitEvidence:
-    """Tracks and patches for ideal cameras, without cameras that are at a guess still."""
-    split = without_patches(scene, optimiser)
-    intrinsics, ideal = _intrinsics(optimiser.lenses.refined(scene.dataset)), split.fitted.intrinsics
-    patches = photo_patches(scene, optimiser, intrinsics, ideal, split.placed)
+def gather_evidence(
+    scene: Scene, renderer: Renderer, options: ResolvedOptions, placed: NDArray[np.bool_]
+) -> SplitEvidence:
+    """Tracks and patches for ideal cameras; of the cameras placed [n] alone."""
+    split = without_patches(scene, renderer.joint, options.refine_intrinsics, placed)
+    intrinsics = _intrinsics(renderer.joint.lenses.refined(scene.dataset))
+    patches = photo_patches(scene, renderer, options, intrinsics, split.fitted.intrinsics, placed)
     if patches is None:
         return split
     spared = np.arange(len(patches)) % LEFT_OUT_ONE_IN == 0
@@ -65,16 +69,17 @@ def gather_evidence(scene: Scene, optimiser: JointOptimiser) -> SplitEvidence:
     )
 
 
-def without_patches(scene: Scene, optimiser: JointOptimiser) -> SplitEvidence:
-    """Tracks for ideal cameras, and what was measured beside photos; without cameras that are at a guess still.
+def without_patches(
+    scene: Scene, joint: JointParameters, refined: RefineIntrinsics, placed: NDArray[np.bool_]
+) -> SplitEvidence:
+    """Tracks for ideal cameras, and what was measured beside photos; of the cameras placed [n] alone.
 
     Photos of another scene match each other, and could outweigh the scene's own.
     """
-    placed = ~optimiser.camera_errors.doubted.cpu().numpy()
-    dataset = optimiser.lenses.refined(scene.dataset)
+    dataset = joint.lenses.refined(scene.dataset)
     intrinsics = _intrinsics(dataset)
     ideal = ideal_cameras(intrinsics)
-    before = lenses_before(scene.dataset, optimiser.options.refine_intrinsics)
+    before = lenses_before(scene.dataset, refined)
     fitted: Tracks | None = None
     judging: Tracks | None = None
     tracks = scene.tracks and scene.tracks.where(placed[scene.tracks.image])
@@ -83,7 +88,7 @@ def without_patches(scene: Scene, optimiser: JointOptimiser) -> SplitEvidence:
         fitted, judging = tracks.split()
         tracks = tracks.thinned(MOST_IN_THE_END, len(dataset))
         fitted = fitted and fitted.thinned(MOST_OBSERVATIONS, len(dataset))
-    measured = measured_evidence(dataset, optimiser.poses.poses().numpy(), placed)
+    measured = measured_evidence(dataset, joint.unit_from_cam, placed)
     return SplitEvidence(
         replace(measured, tracks=fitted, lenses=before if before.free.any() else None),
         Evidence(ideal, judging),

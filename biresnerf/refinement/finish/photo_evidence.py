@@ -7,10 +7,11 @@ from numpy.typing import NDArray
 
 from biresnerf.data.photos.images import ImageSet, load_images
 from biresnerf.geometry.camera.camera import Intrinsics
+from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refinement.adjustment.evidence import Patches, PatchPhotos
 from biresnerf.refinement.adjustment.ideal import resized, straight_photo
 from biresnerf.refinement.adjustment.patch_points import Surfaces, find_patches
-from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.optimise.renderer import Renderer
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.views.evaluation import render_view
 
@@ -21,7 +22,8 @@ MOST_PATCHES, PATCHES_OF_PHOTO = 3000, (20, 200)  # in all, and the least and th
 
 def photo_patches(
     scene: Scene,
-    optimiser: JointOptimiser,
+    renderer: Renderer,
+    options: ResolvedOptions,
     intrinsics: Intrinsics,
     ideal: Intrinsics,
     placed: NDArray[np.bool_],
@@ -32,10 +34,10 @@ def photo_patches(
     """
     if intrinsics.some_fisheye:
         return None
-    images = _larger(scene, optimiser)
+    images, joint = _larger(scene, options), renderer.joint
     widths, heights = images.widths.astype(np.int64), images.heights.astype(np.int64)
     lenses, straight = resized(intrinsics, widths, heights), resized(ideal, widths, heights)
-    gains = optimiser.exposure.gains()
+    gains = joint.exposure.gains()
     photos: list[NDArray[np.float32]] = []
     seen: list[NDArray[np.bool_]] = []
     for i in range(len(images)):
@@ -50,15 +52,13 @@ def photo_patches(
             photo, shown = masked[..., :-1], inside & (masked[..., -1] > 0.99)
         photos.append(np.ascontiguousarray(photo))
         seen.append(shown)
-    surfaces = _surfaces(optimiser, ideal, seen)
+    surfaces = _surfaces(renderer, ideal, seen)
     per_photo = int(np.clip(MOST_PATCHES // len(photos), *PATCHES_OF_PHOTO))
-    poses = optimiser.poses.poses().numpy()
-    return find_patches(
-        poses, ideal, PatchPhotos.stacked(photos), surfaces, per_photo, seed=optimiser.options.seed
-    )
+    stacked = PatchPhotos.stacked(photos)
+    return find_patches(joint.unit_from_cam, ideal, stacked, surfaces, per_photo, seed=options.seed)
 
 
-def _larger(scene: Scene, optimiser: JointOptimiser) -> ImageSet:
+def _larger(scene: Scene, options: ResolvedOptions) -> ImageSet:
     """The photos as large as they are, or as all of them together may be."""
     full = [scene.dataset.camera_of(i) for i in range(len(scene.dataset))]
     pixels = sum(camera.width * camera.height for camera in full)
@@ -66,20 +66,20 @@ def _larger(scene: Scene, optimiser: JointOptimiser) -> ImageSet:
     size = int(share * max(max(camera.width, camera.height) for camera in full))
     if size <= int(max(scene.images.widths.max(), scene.images.heights.max())):
         return scene.images
-    return load_images(scene.dataset, size, optimiser.options.background)
+    return load_images(scene.dataset, size, options.background)
 
 
-def _surfaces(optimiser: JointOptimiser, ideal: Intrinsics, seen: list[NDArray[np.bool_]]) -> Surfaces:
+def _surfaces(renderer: Renderer, ideal: Intrinsics, seen: list[NDArray[np.bool_]]) -> Surfaces:
     """Depth maps through the ideal cameras; `seen` [h, w] are the pixels that count."""
-    working = optimiser.intrinsics
+    working = renderer.joint.lenses.intrinsics
     widths, heights = working.width.cpu().numpy(), working.height.cpu().numpy()
     apart = max(1, int(np.ceil((float((widths * heights).sum()) / MOST_RAYS) ** 0.5)))
     lenses = resized(ideal, np.maximum(widths // apart, 1), np.maximum(heights // apart, 1))
-    lenses = lenses.to(optimiser.device)
-    matrices = optimiser.poses.matrices().detach()
+    lenses = lenses.to(renderer.device)
+    matrices = renderer.joint.poses.matrices().detach()
     surfaces = Surfaces([], [], [])
     for i, pixels in enumerate(seen):
-        view = render_view(optimiser, matrices[i], i, lenses)
+        view = render_view(renderer, matrices[i], i, lenses)
         surfaces.depth.append(view.depth.astype(np.float64))
         surfaces.opacity.append(view.opacity.astype(np.float64))
         surfaces.counts.append(_cells_seen(pixels, *view.depth.shape))

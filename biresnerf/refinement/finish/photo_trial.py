@@ -5,10 +5,12 @@ from __future__ import annotations
 import logging
 
 import numpy as np
+from numpy.typing import NDArray
 
 from biresnerf.data.workload import PHOTO_TRIALS, photo_check
 from biresnerf.geometry.similarity import align_robust
-from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.optimise.methods import Recipe
+from biresnerf.refinement.parameters.joint_parameters import JointParameters
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.run_state import RunState
 from biresnerf.refinement.views.compare_rigs import Effort, Rig, compare_placed
@@ -20,13 +22,13 @@ logger = logging.getLogger(__name__)
 UNSEEN_PX = 0.5
 
 
-def photos_will_be_asked(scene: Scene, optimiser: JointOptimiser) -> bool:
+def photos_will_be_asked(scene: Scene, present: NDArray[np.float64]) -> bool:
     """Whether photos will have to judge the adjusted cameras, as far as the present poses tell.
 
     Cameras that are adjusted to tracks end near those that matches placed: where the present ones are as near, photos
     do not tell them apart. Unknown is yes.
     """
-    matched, present = scene.start.matched_poses, optimiser.poses.poses().numpy()
+    matched = scene.start.matched_poses
     if matched is None or not (np.isfinite(matched).all() and np.isfinite(present).all()):
         return True
     lenses = tuple(scene.dataset.camera_of(i) for i in range(len(scene.dataset)))
@@ -34,7 +36,7 @@ def photos_will_be_asked(scene: Scene, optimiser: JointOptimiser) -> bool:
     return moved_px(Rig(present, lenses), Rig(carried, lenses), scene.images) >= UNSEEN_PX
 
 
-def photos_object(scene: Scene, optimiser: JointOptimiser, run: RunState, other: Rig) -> bool:
+def photos_object(scene: Scene, joint: JointParameters, recipe: Recipe, run: RunState, other: Rig) -> bool:
     """Whether fields trained at other poses predict unseen views less well than at the present ones.
 
     The feature matches of a symmetric thing may agree on poses that are wrong. SSIM has no say: small photos like poses
@@ -43,18 +45,18 @@ def photos_object(scene: Scene, optimiser: JointOptimiser, run: RunState, other:
     Raises:
         Interrupted: stopped.
     """
-    refined = optimiser.lenses.refined(scene.dataset)
-    present = Rig(optimiser.poses.poses().numpy(), tuple(refined.camera_of(i) for i in range(len(refined))))
+    refined = joint.lenses.refined(scene.dataset)
+    present = Rig(joint.unit_from_cam, tuple(refined.camera_of(i) for i in range(len(refined))))
     moved = moved_px(present, other, scene.images)
     if moved < UNSEEN_PX:
         logger.info("the adjusted cameras moved by %.2f px, which photos do not show", moved)
         return False
     run.announce("checking the adjusted cameras by the photos")
-    work = photo_check(optimiser.options, unbounded=optimiser.frame.unbounded)  # known by now, if not before
+    work = photo_check(recipe.options, unbounded=joint.frame.unbounded)  # known by now, if not before
     forecast = run.monitor.forecast
     with run.timed("adjusting", "checking", work):
         found = compare_placed(
-            present, other, scene, optimiser, ~scene.start.guessed, run.monitor.should_stop,
+            present, other, scene, recipe, ~scene.start.guessed, run.monitor.should_stop,
             forecast.advance, Effort(PHOTO_TRIALS, rounds_most=1, looks=(1.0,)),
         )  # fmt: skip
         forecast.took(found.work if found else 0.0)

@@ -94,7 +94,7 @@ def work_ahead(
 def checks_ahead(scene: Scene, optimiser: JointOptimiser, run: RunState) -> bool:
     """Whether photos will judge the adjusted cameras."""
     adjusts = adjusts_cameras(scene.dataset, optimiser.method) and not run.record.adjusted
-    return adjusts and scene.tracks is not None and photos_will_be_asked(scene, optimiser)
+    return adjusts and scene.tracks is not None and photos_will_be_asked(scene, optimiser.joint.unit_from_cam)
 
 
 def adjustment(scene: Scene) -> float:

@@ -169,11 +169,13 @@ class LostCameraRepair:
         for part in torch.arange(len(image), device=optimiser.device).split(CHUNK // ALONE_SIDE**2):
             owner = part.repeat_interleave(ALONE_SIDE**2)
             xy = self._grid(image[owner], ALONE_SIDE)
-            origin, direction = optimiser.cast(matrices[owner], image[owner], xy)
+            origin, direction = optimiser.renderer.cast(matrices[owner], image[owner], xy)
             rendering = self._render(matrices[owner], image[owner], xy, PositionGradient())
             self._spent += FORWARD_COST * rendering.samples
             points.append((origin + rendering.depth[:, None] * direction).reshape(len(part), -1, 3))
-        return shared_shares(torch.cat(points), image, optimiser.poses.matrices(), optimiser.intrinsics)
+        return shared_shares(
+            torch.cat(points), image, optimiser.poses.matrices(), optimiser.lenses.intrinsics
+        )
 
     def _grid(self, image: Tensor, side: int) -> Tensor:
         """Centres [rays, 2] of `side` x `side` pixels spread over each photo; `image` [rays] names it that often."""
@@ -291,7 +293,7 @@ class LostCameraRepair:
         self, matrix: Tensor, image: Tensor, xy: Tensor, gradient: PositionGradient, *, jitter: bool = False
     ) -> Rendering:
         optimiser = self.optimiser
-        origin, direction = optimiser.cast(matrix, image, xy)
+        origin, direction = optimiser.renderer.cast(matrix, image, xy)
         start = torch.full((len(xy),), 0.5)
         if jitter:
             start = torch.rand(len(xy), generator=optimiser.generator)

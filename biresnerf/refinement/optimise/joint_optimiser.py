@@ -12,20 +12,20 @@ from torch import Tensor
 
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.field.backends import directions_for, make_occupancy
-from biresnerf.field.radiance_field import Marching, PositionGradient, Rays, Rendering
-from biresnerf.geometry.camera.camera import Intrinsics
+from biresnerf.field.radiance_field import Marching
 from biresnerf.geometry.perturb import RIG_DISTANCE
 from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.refinement.optimise.async_metrics import AsyncMetrics, StepResult
 from biresnerf.refinement.optimise.camera_errors import CameraErrors
-from biresnerf.refinement.optimise.cast_rays import turned, viewing_directions
 from biresnerf.refinement.optimise.joint_step import StepNumbers, joint_step
 from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.optimise.optimiser_state import Part, StepState, load_state_of, state_of
 from biresnerf.refinement.optimise.photo_sampler import PhotoSampler
 from biresnerf.refinement.optimise.pose_hypotheses import photo_distances
+from biresnerf.refinement.optimise.renderer import Renderer
 from biresnerf.refinement.parameters.exposure import Exposure
 from biresnerf.refinement.parameters.intrinsics_parameters import IntrinsicsParameters
+from biresnerf.refinement.parameters.joint_parameters import JointParameters
 from biresnerf.refinement.parameters.pose_parameters import PoseParameters
 from biresnerf.refinement.scene.scene_frame import SceneFrame
 
@@ -104,15 +104,22 @@ class JointOptimiser:
         """That of the rest of the run, whose options may have changed on its way."""
         return Recipe(self.options, self.method, self.device, self.threads)
 
+    @property
+    def joint(self) -> JointParameters:
+        """All that moves but the field."""
+        robust = self.method.robust_frame
+        return JointParameters(self.frame, self.bodies, self.poses, self.lenses, self.exposure, robust)
+
+    @property
+    def renderer(self) -> Renderer:
+        """The field as it is now."""
+        marching = self.marching(self.schedule.fine_interval)
+        return Renderer(self.field, self.joint, marching, self.background, self.directions, self.draws)
+
     @cached_property
     def photo_distances(self) -> NDArray[np.float32]:
         """How unlike the photos are, see `photo_distances`; computed when a lost camera first needs it."""
         return photo_distances(self._images)
-
-    @property
-    def intrinsics(self) -> Intrinsics:
-        """Every image's intrinsics at working size, as they are now."""
-        return self.lenses.intrinsics
 
     def _pose_parameters(self, unit_from_cam: Tensor) -> PoseParameters:
         return PoseParameters(
@@ -151,43 +158,6 @@ class JointOptimiser:
         merging = self.method.merging if self.switch is not None else None  # stage 1 needs every sample
         return Marching(interval, near, far, MOST_SAMPLES, self.occupancy.occupied, merging)
 
-    def cast(
-        self, matrix: Tensor, image: Tensor, xy: Tensor, intrinsics: Intrinsics | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Origin and direction [rays, 3] in the unit frame of pixels `xy` [rays, 2] seen by cameras of images.
-
-        `matrix` [rays, 3, 4] is each ray's unit_from_cam; `intrinsics` are the run's images' where not given.
-        """
-        lenses = intrinsics or self.intrinsics
-        return turned(matrix, viewing_directions(self.directions, lenses, image, xy))
-
-    def render(
-        self,
-        origin: Tensor,
-        direction: Tensor,
-        trained: int,
-        interval: float,
-        gradient: PositionGradient,
-        *,
-        jitter: bool,
-    ) -> Rendering:
-        """Render rays over the scene's background; `jitter` randomises where sampling starts."""
-        return self.field.render(
-            self.over_background(origin, direction, trained, jitter=jitter), self.marching(interval), gradient
-        )
-
-    def over_background(self, origin: Tensor, direction: Tensor, trained: int, *, jitter: bool) -> Rays:
-        """Rays before the scene's background, the first `trained` of which teach the field."""
-        count = len(origin)
-        shape = (count,) if self.field.stratified is None else (count, self.field.stratified)
-        start = (
-            torch.rand(shape, generator=self.draws, device=self.device)
-            if jitter
-            else torch.full(shape, 0.5, device=self.device)
-        )
-        background = self.background.expand(count, 3).contiguous()
-        return Rays(origin, direction, background, start, trained)
-
     def step(self) -> StepResult:
         """One step of the joint optimisation."""
         t, schedule = self.step_index, self.schedule
@@ -195,7 +165,7 @@ class JointOptimiser:
         if t % OCCUPANCY_PERIOD == 0 and self.method.pruned:
             self._update_occupancy(t)
         told = self._numbers()
-        done = joint_step(self, told)
+        done = joint_step(self.renderer, self.sampler, self.camera_errors, self.method, told)
         self.step_index += 1
         self._adapt_rays(done.samples, int(self.batch_share * schedule.samples(t, self.switch)))
         loss, error = self.metrics.read(done.loss, done.error)
@@ -211,6 +181,7 @@ class JointOptimiser:
             rates=schedule.field_rates(t, switch),
             blur=schedule.blur(t, switch, self.sampler.long_side),
             pose_rate=self.pose_rate(),
+            mobility=self.mobility[0 if switch is None else 1],
             lens_rate=0.0 if held else schedule.lens_rate(t, switch),
             moves_focal=schedule.focal_moves(switch),
         )

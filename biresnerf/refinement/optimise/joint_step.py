@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
-import torch
 from torch import Tensor
 
-from biresnerf.field.backends import Directions
-from biresnerf.field.radiance_field import FieldRates, Marching, PositionGradient, RadianceField, Rays
+from biresnerf.field.radiance_field import FieldRates, Marching, PositionGradient
 from biresnerf.refinement.optimise.camera_errors import CameraErrors
-from biresnerf.refinement.optimise.cast_rays import cast_rays, viewing_directions
 from biresnerf.refinement.optimise.methods import Method
-from biresnerf.refinement.optimise.photo_sampler import PhotoSampler, PixelBatch
-from biresnerf.refinement.parameters.exposure import Exposure
-from biresnerf.refinement.parameters.intrinsics_parameters import IntrinsicsParameters
-from biresnerf.refinement.parameters.pose_parameters import PoseParameters
+from biresnerf.refinement.optimise.photo_sampler import PhotoSampler
+from biresnerf.refinement.optimise.renderer import Renderer, cast_rays, viewing_directions
 
 
 @dataclass(frozen=True)
 class StepNumbers:
-    """All that changes from step to step, besides tensors and random numbers.
+    """All that changes from step to step, besides what moves and random numbers.
 
     Attributes:
+        mobility: each camera's factor of the pose rate [n].
         blur: standard deviation (px) of the photos' blur before its random factor.
         moves_focal: whether focal lengths move, where lenses do.
     """
@@ -34,6 +29,7 @@ class StepNumbers:
     rates: FieldRates
     blur: float
     pose_rate: float
+    mobility: Tensor
     lens_rate: float
     moves_focal: bool
 
@@ -47,59 +43,39 @@ class StepOutcome:
     samples: int
 
 
-class Trained(Protocol):
-    """What a step reads and moves; see `JointOptimiser`."""
-
-    field: RadianceField
-    poses: PoseParameters
-    lenses: IntrinsicsParameters
-    exposure: Exposure
-    camera_errors: CameraErrors
-    sampler: PhotoSampler
-    directions: Directions
-    draws: torch.Generator
-    mobility: Tensor
-    method: Method
-    switch: int | None
-
-    def over_background(self, origin: Tensor, direction: Tensor, trained: int, *, jitter: bool) -> Rays: ...
-
-
-def joint_step(optimiser: Trained, told: StepNumbers) -> StepOutcome:
+def joint_step(
+    renderer: Renderer, sampler: PhotoSampler, camera_errors: CameraErrors, method: Method, told: StepNumbers
+) -> StepOutcome:
     """Draw pixels, render them, and move field, poses, lenses and exposures by the gradients of the loss."""
-    field, poses, exposure = optimiser.field, optimiser.poses, optimiser.exposure
+    field, joint = renderer.field, renderer.joint
+    poses, exposure = joint.poses, joint.exposure
     moves_poses, moves_lenses = told.pose_rate > 0, told.lens_rate > 0
-    batch = optimiser.sampler.draw(told.rays, told.blur, optimiser.draws)
+    batch = sampler.draw(told.rays, told.blur, renderer.draws)
     matrices = poses.matrices()
     if not moves_poses:
         matrices = matrices.detach()
     if moves_lenses:
-        matrices, lenses = optimiser.lenses.with_gradient(matrices)
+        matrices, lenses = joint.lenses.with_gradient(matrices)
     else:
-        lenses = optimiser.lenses.intrinsics
-    in_cam = viewing_directions(optimiser.directions, lenses, batch.image, batch.xy)
+        lenses = joint.lenses.intrinsics
+    in_cam = viewing_directions(renderer.directions, lenses, batch.image, batch.xy)
     origin, direction = cast_rays(matrices, batch.image, in_cam)
-    rays = optimiser.over_background(origin, direction, batch.trained, jitter=True)
+    rays = renderer.over_background(origin, direction, batch.trained, jitter=True)
     rendering = field.render(rays, told.marching, told.gradient)
     colour = exposure.shown(rendering, batch.image)
-    loss = _loss(optimiser, exposure.forgiven(colour, batch.target), batch)
+    weight, of_camera = batch.weight, camera_errors.weights
+    if of_camera is not None and method.weights:
+        weight = weight * of_camera[batch.image]
+    loss = (method.loss(exposure.forgiven(colour, batch.target), batch.target) * weight[:, None]).mean()
     loss.backward()
     field.step(told.rates)
     exposure.step(told.rates.networks)
     if moves_poses:
-        mobility = optimiser.mobility[0 if optimiser.switch is None else 1]
-        poses.step(told.pose_rate, mobility, field_rate=told.rates.networks)
+        poses.step(told.pose_rate, told.mobility, field_rate=told.rates.networks)
         if moves_lenses:
-            poses.dolly(optimiser.lenses.step(told.lens_rate, focal=told.moves_focal))
+            poses.dolly(joint.lenses.step(told.lens_rate, focal=told.moves_focal))
     shown = colour.detach().clamp(max=1)
-    optimiser.camera_errors.add(batch.image, shown, batch.target, rendering.opacity.detach(), batch.weight)
+    camera_errors.add(batch.image, shown, batch.target, rendering.opacity.detach(), batch.weight)
     error = ((shown - batch.sharp) ** 2 * batch.weight[:, None])[: batch.trained].mean()
     # A pose that is not finite sees nothing, so the loss stays finite.
     return StepOutcome(loss.detach() + poses.zero_if_finite(), error, rendering.samples)
-
-
-def _loss(optimiser: Trained, colour: Tensor, batch: PixelBatch) -> Tensor:
-    weight, of_camera = batch.weight, optimiser.camera_errors.weights
-    if of_camera is not None and optimiser.method.weights:
-        weight = weight * of_camera[batch.image]
-    return (optimiser.method.loss(colour, batch.target) * weight[:, None]).mean()

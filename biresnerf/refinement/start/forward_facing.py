@@ -62,7 +62,7 @@ def find_forward_facing(
             if should_stop():
                 raise Interrupted("stopped while poses were looked for without features")
             optimiser.step()
-        psnr = float(np.mean([score.psnr for score in score_views(optimiser, images, unseen)]))
+        psnr = float(np.mean([score.psnr for score in score_views(optimiser.renderer, images, unseen)]))
         return frame.unit_from_world.inverse().apply_to_poses(optimiser.poses.poses().numpy()), psnr
 
     first, _ = run(world_from_cam, FIRST_STEPS)

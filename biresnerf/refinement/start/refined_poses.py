@@ -11,8 +11,9 @@ from torch import Tensor
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.points.located_points import metres_from_world
 from biresnerf.geometry.similarity import Similarity, align_by_spread, align_robust
-from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.parameters.intrinsics_parameters import IntrinsicsParameters
+from biresnerf.refinement.parameters.joint_parameters import JointParameters
+from biresnerf.refinement.scene.scene_frame import SceneFrame
 
 Array = NDArray[np.float64]
 
@@ -36,24 +37,24 @@ class RefinedPoses:
     dataset: Dataset
 
     @classmethod
-    def now(cls, dataset: Dataset, optimiser: JointOptimiser) -> RefinedPoses:
+    def now(cls, dataset: Dataset, joint: JointParameters) -> RefinedPoses:
         """Those of this moment."""
-        return cls._of(dataset, optimiser, optimiser.poses.poses().numpy(), optimiser.lenses)
+        return cls._of(dataset, joint, joint.unit_from_cam, joint.lenses)
 
     @classmethod
     def at(
-        cls, dataset: Dataset, optimiser: JointOptimiser, unit_from_cam: Array, increments: Tensor
+        cls, dataset: Dataset, joint: JointParameters, unit_from_cam: Array, increments: Tensor
     ) -> RefinedPoses:
         """Those of an earlier moment: poses [n, 4, 4] in the unit frame, and increments of the lenses."""
-        return cls._of(dataset, optimiser, unit_from_cam, optimiser.lenses.at(increments))
+        return cls._of(dataset, joint, unit_from_cam, joint.lenses.at(increments))
 
-    def input_from_unit(self, optimiser: JointOptimiser) -> Similarity:
+    def input_from_unit(self, frame: SceneFrame) -> Similarity:
         """From the unit frame that the optimisation is in."""
-        return self.input_from_optimised @ optimiser.frame.unit_from_world.inverse()
+        return self.input_from_optimised @ frame.unit_from_world.inverse()
 
     @classmethod
     def _of(
-        cls, dataset: Dataset, optimiser: JointOptimiser, unit_from_cam: Array, lenses: IntrinsicsParameters
+        cls, dataset: Dataset, joint: JointParameters, unit_from_cam: Array, lenses: IntrinsicsParameters
     ) -> RefinedPoses:
         """The optimisation leaves frame and scale free.
 
@@ -61,16 +62,16 @@ class RefinedPoses:
         unless the method says otherwise. Fixed cameras and rigs leave less free. Where nobody gave poses, measured
         places fix the frame that they gave to those that were found.
         """
-        optimised = optimiser.frame.unit_from_world.inverse().apply_to_poses(unit_from_cam)
+        optimised = joint.frame.unit_from_world.inverse().apply_to_poses(unit_from_cam)
         given, tied = dataset.world_from_cam, dataset.anchors
-        input_from_optimised = optimiser.bodies.input_from_optimised(optimised, given)
+        input_from_optimised = joint.bodies.input_from_optimised(optimised, given)
         refined = lenses.refined(dataset)
         input_from_optimised = input_from_optimised or _as_measured(dataset, optimised, refined)
-        if input_from_optimised is None and optimiser.method.robust_frame:
+        if input_from_optimised is None and joint.robust_frame:
             input_from_optimised = align_robust(optimised[tied], given[tied], with_rotations=True)
         elif input_from_optimised is None:
             input_from_optimised = align_by_spread(optimised[tied], given[tied])
-        carried = optimiser.bodies.restored(input_from_optimised.apply_to_poses(optimised), given)
+        carried = joint.bodies.restored(input_from_optimised.apply_to_poses(optimised), given)
         return cls(carried, input_from_optimised, lenses, refined)
 
 

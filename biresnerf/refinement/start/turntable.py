@@ -95,7 +95,7 @@ class RingTrials:
             if self._should_stop():
                 raise Interrupted("stopped while rings of cameras were tried")
             optimiser.step()
-        unseen = score_unseen(optimiser, self.images, self.unseen, self._stride)
+        unseen = score_unseen(optimiser.renderer, self.images, self.unseen, self._stride)
         return Tried(moving.now().detached(), float(unseen.psnr.mean()))
 
 

@@ -74,17 +74,17 @@ def evaluate(scene: Scene, optimiser: JointOptimiser, run: RunState, pictures: P
             run.report_evaluation(done / max(1, work), done, work)
 
         report(0)
-        evaluation = Evaluation()
+        evaluation, renderer = Evaluation(), optimiser.renderer
         shown = chain(first, _while_cheap(further, sum(run.record.seconds.values())))
-        for score in score_views(optimiser, scene.images, shown):
+        for score in score_views(renderer, scene.images, shown):
             evaluation.views.append(pictures.write_view(score))
-            evaluation.surfaces.append(surface_of(optimiser, score))
+            evaluation.surfaces.append(surface_of(renderer, score))
             if score.image in scene.held_out:
                 evaluation.scores.append(score)
             report(len(evaluation.views))
         if frames:
             views = len(first) + len(further)
-            pictures.write_orbit(render_orbit(optimiser, frames, lambda i: report(views + i + 1)))
+            pictures.write_orbit(render_orbit(renderer, frames, lambda i: report(views + i + 1)))
         return evaluation
 
 

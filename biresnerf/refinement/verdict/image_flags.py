@@ -7,8 +7,8 @@ import torch
 from numpy.typing import NDArray
 
 from biresnerf.data.photos.images import ImageSet
-from biresnerf.field.radiance_field import PositionGradient
-from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.optimise.photo_sampler import PhotoSampler
+from biresnerf.refinement.optimise.renderer import Renderer
 
 Array = NDArray[np.float64]
 
@@ -53,18 +53,15 @@ def _four_neighbours(values: Array) -> Array:
 
 
 @torch.no_grad()
-def gains(optimiser: JointOptimiser) -> Array:
+def gains(renderer: Renderer, sampler: PhotoSampler, draws: torch.Generator) -> Array:
     """Brightness of each photo over that of its render [n], from random pixels that show the scene; NaN if none do."""
-    count = len(optimiser.poses)
-    batch = optimiser.sampler.draw(GAIN_RAYS * count, 0.0, optimiser.generator)
+    count = len(renderer.joint.poses)
+    batch = sampler.draw(GAIN_RAYS * count, 0.0, draws)
     shown, rendered = np.zeros(count), np.zeros(count)
-    matrices = optimiser.poses.matrices().detach()
-    for part in torch.arange(len(batch.image), device=optimiser.device).split(GAIN_RAYS * 32):
+    matrices = renderer.joint.poses.matrices().detach()
+    for part in torch.arange(len(batch.image), device=renderer.device).split(GAIN_RAYS * 32):
         image = batch.image[part]
-        origin, direction = optimiser.cast(matrices[image], image, batch.xy[part])
-        rendering = optimiser.render(
-            origin, direction, 0, optimiser.schedule.fine_interval, PositionGradient(), jitter=False
-        )
+        rendering = renderer.render(*renderer.cast(matrices[image], image, batch.xy[part]))
         seen = (rendering.opacity > 0.5).float() * batch.weight[part]  # the background shines as it likes
         for total, colour in ((shown, batch.sharp[part]), (rendered, rendering.colour)):
             values = (colour.mean(1) * seen).double().cpu().numpy()

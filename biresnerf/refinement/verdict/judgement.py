@@ -21,6 +21,7 @@ from biresnerf.refinement.finish.gather_evidence import measured_evidence
 from biresnerf.refinement.finish.outcome import Finish
 from biresnerf.refinement.lost.own_matches import contradicted
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.parameters.joint_parameters import JointParameters
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.run_state import RunState
 from biresnerf.refinement.start.refined_poses import RefinedPoses
@@ -113,11 +114,13 @@ def judge_poses(
     """
     report = partial(run.report_evaluation, message="comparing the refined poses with the input's")
     report(0.0)
-    refined = RefinedPoses.now(scene.dataset, optimiser)
+    joint = optimiser.joint
+    refined = RefinedPoses.now(scene.dataset, joint)
     lost = int(optimiser.camera_errors.lost.sum())
     found = compare_without_training(scene, refined, lost)
     # Only then it matters what the evidence determines: to know it, a matrix of all cameras is inverted.
-    errors = _errors(refined, optimiser, finish) if matches_are_better(found.findings) else None
+    asked = matches_are_better(found.findings) and optimiser.method.uncertainty
+    errors = _errors(refined, joint, finish) if asked else None
     told = replace(found.findings, determined=_determined(errors, finish))
     heldout: HeldOutComparison | None = None
     work = 0.0
@@ -126,7 +129,7 @@ def judge_poses(
         rounds = max(_rounds(run, 1), 1)
         for each in (effort, replace(effort, times=LONGER, looks=(1.0,))):
             heldout = compare_placed(
-                found.before, found.after, scene, optimiser, found.placed | (not told.grounded),
+                found.before, found.after, scene, optimiser.recipe, found.placed | (not told.grounded),
                 run.monitor.should_stop, report, replace(each, rounds_most=rounds),
             )  # fmt: skip
             work += heldout.work if heldout else 0.0
@@ -137,7 +140,8 @@ def judge_poses(
                 break
     run.monitor.forecast.took(JUDGING + work)
     verdict = decide(replace(told, heldout=heldout.evidence if heldout else None))
-    return replace(_with_images(verdict, scene, optimiser, found, heldout), errors=errors)
+    gain = image_flags.gains(optimiser.renderer, optimiser.sampler, optimiser.generator)
+    return replace(_with_images(verdict, scene, gain, found, heldout), errors=errors)
 
 
 def _determined(errors: ExpectedErrors | None, finish: Finish) -> float | None:
@@ -147,12 +151,12 @@ def _determined(errors: ExpectedErrors | None, finish: Finish) -> float | None:
     return None if errors is None else float(errors.known.mean())
 
 
-def _errors(refined: RefinedPoses, optimiser: JointOptimiser, finish: Finish) -> ExpectedErrors | None:
-    """What the evidence says of the errors of refined poses; None where the method or the evidence says nothing."""
+def _errors(refined: RefinedPoses, joint: JointParameters, finish: Finish) -> ExpectedErrors | None:
+    """What the evidence says of the errors of refined poses; None where it says nothing."""
     poses = refined.world_from_cam
-    if finish.fit is None or not (optimiser.method.uncertainty and np.isfinite(poses).all()):
+    if finish.fit is None or not np.isfinite(poses).all():
         return None
-    return finish.fit.errors_of(poses, refined.input_from_unit(optimiser), optimiser.bodies)
+    return finish.fit.errors_of(poses, refined.input_from_unit(joint.frame), joint.bodies)
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,7 +253,7 @@ def _source_of_poses(dataset: Dataset) -> Literal["given", "seeded", "mixed"]:
 def _with_images(
     verdict: Verdict,
     scene: Scene,
-    optimiser: JointOptimiser,
+    gain: Array,
     found: Compared,
     heldout: HeldOutComparison | None,
 ) -> Judgement:
@@ -261,7 +265,6 @@ def _with_images(
         epipolar_px[:] = errors_px(found.before, found.after, scene.tracks)
     before = found.before.world_from_cam
     sharpness = image_flags.sharpness(images, before)
-    gain = image_flags.gains(optimiser)
     distance = focus_point(before).mean_distance
     return Judgement(
         verdict=verdict,

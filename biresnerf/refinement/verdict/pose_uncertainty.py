@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.geometry.focus import focus_point, rms_spread
 from biresnerf.refinement.finish.expected_errors import ExpectedErrors
 from biresnerf.refinement.finish.outcome import Finish
 from biresnerf.refinement.lost.own_matches import contradicted
-from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.parameters.joint_parameters import JointParameters
 from biresnerf.refinement.start.refined_poses import RefinedPoses
 from biresnerf.refinement.verdict.judgement import Judgement
 from biresnerf.uncertainty import KnownFrom, PoseUncertainty
@@ -22,27 +23,29 @@ OPEN = "their matches do not determine them"
 
 
 def pose_uncertainty(
-    dataset: Dataset, optimiser: JointOptimiser, finish: Finish, judgement: Judgement | None
+    dataset: Dataset,
+    joint: JointParameters,
+    finish: Finish,
+    judgement: Judgement | None,
+    lost: NDArray[np.bool_],
 ) -> tuple[PoseUncertainty, ...]:
-    """Of each image's returned pose; of none where the method tells none.
+    """Of each image's returned pose.
 
     Args:
+        lost: cameras [n] that agree with no pose found.
         finish: with the poses that fit all evidence that is to be trusted.
         judgement: None where there is no verdict, and the refined poses are returned.
     """
-    if not optimiser.method.uncertainty:
-        return ()
-    refined = RefinedPoses.now(dataset, optimiser)
+    refined = RefinedPoses.now(dataset, joint)
     poses, found = refined.world_from_cam, None if judgement is None else judgement.errors
     errors_px = np.full((2, len(dataset)), np.nan) if judgement is None else judgement.epipolar_px
     wrong = contradicted(errors_px[1])
     if judgement is not None and judgement.verdict.returned == "input":
         poses, found, wrong = dataset.world_from_cam, None, contradicted(errors_px[0])
     if found is None and finish.fit is not None and np.isfinite(poses).all():
-        found = finish.fit.errors_of(poses, refined.input_from_unit(optimiser), optimiser.bodies)
-    lost = optimiser.camera_errors.lost.tolist()
+        found = finish.fit.errors_of(poses, refined.input_from_unit(joint.frame), joint.bodies)
     reasons = [
-        FIXED if optimiser.bodies.fixed[i]
+        FIXED if joint.bodies.fixed[i]
         else MATCHES_CONTRADICT if wrong[i]
         else None if found is not None and found.known[i]
         else LOST if lost[i]

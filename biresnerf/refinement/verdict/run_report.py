@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.photo_folders import few_names
@@ -21,7 +22,9 @@ from biresnerf.refinement.lost.own_matches import LEAST_PAIRS
 from biresnerf.refinement.optimise.device_memory import smaller_batches
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.method_changes import method_warnings
+from biresnerf.refinement.optimise.renderer import Renderer
 from biresnerf.refinement.parameters.intrinsics_parameters import FocalCertainty, IntrinsicsParameters
+from biresnerf.refinement.parameters.joint_parameters import JointParameters
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.checkpoint import RunRecord
 from biresnerf.refinement.start.matches_explained import explained_from_one_place
@@ -67,17 +70,18 @@ def run_report(
     from biresnerf import __version__
 
     finish, judgement, so_far = found.finish, found.judgement, found.so_far
+    joint, untrained = optimiser.joint, optimiser.camera_errors.held_out
     dataset, given = scene.dataset, finish.given if finish is not None else None
-    refined = so_far.refined if so_far is not None else RefinedPoses.now(dataset, optimiser)
+    refined = so_far.refined if so_far is not None else RefinedPoses.now(dataset, joint)
     return Report(
         version=__version__,
         state="partial" if finish is None else "complete",
         options=optimiser.options,
         verdict=judgement.verdict if judgement is not None else None,
         verdict_so_far=so_far.verdict if so_far is not None else None,
-        images=_image_reports(scene, optimiser, repaired, refined.world_from_cam, found),
+        images=_image_reports(scene, joint, repaired, refined.world_from_cam, found),
         cameras=camera_reports(dataset, refined.lenses),
-        heldout=held_out_report(optimiser, found.scores) if found.scores else None,
+        heldout=held_out_report(optimiser.renderer, untrained, found.scores) if found.scores else None,
         start_trials=scene.start.trials,
         candidates=finish.candidates if finish is not None else (),
         input_accuracy=given and accuracy_report(given),
@@ -147,15 +151,15 @@ def focal_warnings(dataset: Dataset, lenses: IntrinsicsParameters) -> tuple[str,
     return tuple(found)
 
 
-def held_out_report(optimiser: JointOptimiser, scores: Sequence[ViewScore]) -> HeldOut:
-    """Means over the held-out views, at their present poses."""
-    matrices = optimiser.poses.matrices().detach()
+def held_out_report(renderer: Renderer, held_out: Tensor, scores: Sequence[ViewScore]) -> HeldOut:
+    """Means over the held-out views, bool [n], at their present poses."""
+    matrices = renderer.joint.poses.matrices().detach()
     return HeldOut(
         count=len(scores),
         psnr=float(np.mean([s.psnr for s in scores])),
         ssim=float(np.mean([s.ssim for s in scores])),
         unshared_opacity=float(
-            np.mean([unshared_opacity(optimiser, matrices[s.image], s.image) for s in scores])
+            np.mean([unshared_opacity(renderer, held_out, matrices[s.image], s.image) for s in scores])
         ),
     )
 
@@ -227,12 +231,12 @@ def _unknown_warnings(dataset: Dataset, uncertainty: tuple[PoseUncertainty, ...]
 
 def _image_reports(
     scene: Scene,
-    optimiser: JointOptimiser,
+    joint: JointParameters,
     repaired: Collection[int],
     refined: np.ndarray,
     found: Findings,
 ) -> tuple[ImageReport, ...]:
-    exposures = optimiser.exposure.gains()
+    exposures = joint.exposure.gains()
     turn, shift = motion(scene.dataset.world_from_cam, refined)
     scored = {score.image: score for score in found.scores}
     return tuple(
@@ -240,7 +244,7 @@ def _image_reports(
             name=frame.name,
             pose_source=scene.start.sources[i],
             held_out=i in scene.held_out,
-            fixed=bool(optimiser.bodies.fixed[i]),
+            fixed=bool(joint.bodies.fixed[i]),
             moved_deg=float(turn[i]),
             moved_units=float(shift[i]),
             uncertainty=found.uncertainty[i] if found.uncertainty else None,

@@ -52,7 +52,8 @@ def poses_so_far(scene: Scene, optimiser: JointOptimiser, run: RunState) -> SoFa
     their place unless matches say that they are worse than the best ever measured, by as much as matters. No field is
     trained for it: it takes as long as a few steps.
     """
-    best, now = run.record.best, RefinedPoses.now(scene.dataset, optimiser)
+    joint = optimiser.joint
+    best, now = run.record.best, RefinedPoses.now(scene.dataset, joint)
     if not optimiser.options.verdict:
         return SoFar(now, None)
     verdict = _verdict(scene, optimiser, now)
@@ -60,8 +61,8 @@ def poses_so_far(scene: Scene, optimiser: JointOptimiser, run: RunState) -> SoFa
     worse = best is not None and compare(gain - best.gain, LATER_MATCH_ERRORS).finding == "worse"
     if verdict.returned == "refined" and not worse:
         best = BestSoFar(
-            unit_from_cam=optimiser.poses.poses().numpy().copy(),
-            increments=optimiser.lenses.increments.detach().cpu().numpy().copy(),
+            unit_from_cam=joint.unit_from_cam.copy(),
+            increments=joint.lenses.increments.detach().cpu().numpy().copy(),
             verdict=verdict,
             gain=gain if best is None else max(gain, best.gain),
         )
@@ -70,25 +71,20 @@ def poses_so_far(scene: Scene, optimiser: JointOptimiser, run: RunState) -> SoFa
     if best is None:
         return SoFar(now, verdict)
     increments = torch.from_numpy(best.increments)
-    return SoFar(RefinedPoses.at(scene.dataset, optimiser, best.unit_from_cam, increments), best.verdict)
+    return SoFar(RefinedPoses.at(scene.dataset, joint, best.unit_from_cam, increments), best.verdict)
 
 
 def _verdict(scene: Scene, optimiser: JointOptimiser, refined: RefinedPoses) -> Verdict:
     """By all but unseen views; where nothing else speaks for or against them, refined poses are offered."""
     lost = int(optimiser.camera_errors.lost.sum())
     findings = compare_without_training(scene, refined, lost).findings
-    if matches_are_better(findings):
-        findings = replace(findings, determined=_determined(scene, optimiser))
+    if matches_are_better(findings) and optimiser.method.uncertainty:
+        placed = ~optimiser.camera_errors.doubted.cpu().numpy()
+        of_lenses, joint = optimiser.options.refine_intrinsics, optimiser.joint
+        evidence = without_patches(scene, joint, of_lenses, placed).fitted
+        errors = expected_errors(joint.unit_from_cam, joint.unit_from_cam, evidence, bodies=joint.bodies)
+        findings = replace(findings, determined=float(errors.known.mean()))
     verdict = decide(findings)
     if findings.epipolar is not None or verdict.verdict != "inconclusive":
         return verdict
     return verdict.model_copy(update={"returned": "refined", "why": (UNMEASURED, *verdict.why)})
-
-
-def _determined(scene: Scene, optimiser: JointOptimiser) -> float | None:
-    """The share of cameras whose present poses tracks determine; None where the method does not ask."""
-    if not optimiser.method.uncertainty:
-        return None
-    poses = optimiser.poses.poses().numpy()
-    evidence = without_patches(scene, optimiser).fitted
-    return float(expected_errors(poses, poses, evidence, bodies=optimiser.bodies).known.mean())

@@ -12,7 +12,6 @@ from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.workload import LOOKS, picture_share
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.judging.compare import UNSEEN_PSNR, UNSEEN_SSIM, compare, paired
-from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.views.held_out_views import ROUNDS_MOST, unseen_rounds
@@ -198,7 +197,7 @@ def compare_placed(
     before: Rig,
     after: Rig,
     scene: Scene,
-    optimiser: JointOptimiser,
+    recipe: Recipe,
     placed: NDArray[np.bool_],
     should_stop: Callable[[], bool],
     report: Callable[[float], None] = lambda _share: None,
@@ -209,7 +208,7 @@ def compare_placed(
     images = scene.images if placed.all() else scene.images.of(rows)
     held_out = np.flatnonzero(np.isin(rows, scene.held_out)).tolist()
     found = compare_on_unseen_views(
-        (before.of(rows), after.of(rows)), images, held_out, optimiser.recipe, should_stop, report, effort
+        (before.of(rows), after.of(rows)), images, held_out, recipe, should_stop, report, effort
     )
     if found is None:
         return None

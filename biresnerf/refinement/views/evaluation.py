@@ -10,10 +10,12 @@ import torch
 from torch import Tensor
 
 from biresnerf.data.photos.images import ImageSet
-from biresnerf.field.radiance_field import PositionGradient, Rendering
+from biresnerf.field.radiance_field import Rendering
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.optimise.methods import Method
 from biresnerf.refinement.optimise.photo_sampler import PixelBatch
+from biresnerf.refinement.optimise.renderer import Renderer
 from biresnerf.refinement.views.image_metrics import psnr, ssim
 
 FIT_STEPS, FIT_RATE, FIT_RAYS = 100, 1e-3, 1024  # BARF's test-time pose refinement
@@ -41,9 +43,9 @@ class ViewScore:
     ssim: float
 
 
-def fit_rays(optimiser: JointOptimiser) -> int:
+def fit_rays(method: Method, rays: int) -> int:
     """Rays of one step of fitting poses to the frozen field: as BARF, but no more than a large network can afford."""
-    return min(FIT_RAYS, optimiser.rays) if optimiser.method.large_network else FIT_RAYS
+    return min(FIT_RAYS, rays) if method.large_network else FIT_RAYS
 
 
 def fit_held_out_poses(optimiser: JointOptimiser, held_out: list[int]) -> None:
@@ -59,14 +61,22 @@ def fit_held_out_poses(optimiser: JointOptimiser, held_out: list[int]) -> None:
     mobility[torch.from_numpy(optimiser.bodies.fixed).to(optimiser.device)] = 0.0
     poses.restart_adam()
     exposure.restart_adam()
+
+    def seen(rays: int) -> tuple[PixelBatch, Rendering]:
+        """Pixels drawn from the held-out photos, and what the field shows there from the present poses."""
+        renderer = optimiser.renderer
+        batch = optimiser.sampler.draw(rays, 0.0, optimiser.generator, held_out_only=True)
+        cast = renderer.cast(poses.matrices()[batch.image], batch.image, batch.xy)
+        return batch, renderer.render(*cast, jitter=True)
+
     if held:  # what is seen of the field stays the same
         with torch.no_grad():
-            batch, rendering = _seen_by_held_out(optimiser, CHUNK)
+            batch, rendering = seen(CHUNK)
     # Not longer than the field was trained, or a short run would take longer to measure than to do.
     steps = FIT_STEPS if held else min(FIT_STEPS, optimiser.options.steps)
     for step in range(steps):
         if not held:
-            batch, rendering = _seen_by_held_out(optimiser, fit_rays(optimiser))
+            batch, rendering = seen(fit_rays(optimiser.method, optimiser.rays))
         colour = exposure.forgiven(exposure.shown(rendering, batch.image), batch.sharp)
         (optimiser.method.loss(colour, batch.sharp) * batch.weight[:, None]).mean().backward()
         if not held:
@@ -74,18 +84,9 @@ def fit_held_out_poses(optimiser: JointOptimiser, held_out: list[int]) -> None:
         exposure.step(FIT_EXPOSURE_RATE * 0.1 ** (step / steps))
 
 
-def _seen_by_held_out(optimiser: JointOptimiser, rays: int) -> tuple[PixelBatch, Rendering]:
-    """Pixels drawn from the held-out photos, and what the field shows there from the present poses."""
-    batch = optimiser.sampler.draw(rays, 0.0, optimiser.generator, held_out_only=True)
-    matrices = optimiser.poses.matrices()[batch.image]
-    origin, direction = optimiser.cast(matrices, batch.image, batch.xy)
-    interval = optimiser.schedule.fine_interval
-    return batch, optimiser.render(origin, direction, 0, interval, PositionGradient(), jitter=True)
-
-
 @torch.no_grad()
 def render_view(
-    optimiser: JointOptimiser,
+    renderer: Renderer,
     unit_from_cam: Tensor,
     image: int,
     intrinsics: Intrinsics | None = None,
@@ -100,29 +101,29 @@ def render_view(
     gives it the exposure of photo `image`, to be compared with it; else it has the mean exposure of all. Rays are
     marched at `coarser` times the fine interval.
     """
-    lenses = intrinsics or optimiser.intrinsics
+    lenses = intrinsics or renderer.joint.lenses.intrinsics
     width, height = int(lenses.width[image]), int(lenses.height[image])
     rows, columns = torch.arange(0, height, stride) + 0.5, torch.arange(0, width, stride) + 0.5
     y, x = torch.meshgrid(rows, columns, indexing="ij")
-    pixels = torch.stack([x, y], -1).reshape(-1, 2).to(optimiser.device)
-    parts, interval = [], coarser * optimiser.schedule.fine_interval
+    pixels = torch.stack([x, y], -1).reshape(-1, 2).to(renderer.device)
+    parts = []
     for xy in pixels.split(CHUNK):
-        index = torch.full((len(xy),), image, device=optimiser.device)
-        origin, direction = optimiser.cast(
-            unit_from_cam.float().to(optimiser.device).expand(len(xy), 3, 4), index, xy, lenses
+        index = torch.full((len(xy),), image, device=renderer.device)
+        origin, direction = renderer.cast(
+            unit_from_cam.float().to(renderer.device).expand(len(xy), 3, 4), index, xy, lenses
         )
-        part = optimiser.render(origin, direction, 0, interval, PositionGradient(), jitter=False)
-        colour = optimiser.exposure.shown(part, index) if as_photo else part.colour
+        part = renderer.render(origin, direction, coarser=coarser)
+        colour = renderer.joint.exposure.shown(part, index) if as_photo else part.colour
         parts.append(torch.cat([colour, part.depth[:, None], part.opacity[:, None]], 1).cpu())
     whole = torch.cat(parts).reshape(len(rows), len(columns), 5).numpy()
     return RenderedView(whole[..., :3].clip(0, 1), whole[..., 3], whole[..., 4])
 
 
-def score_views(optimiser: JointOptimiser, images: ImageSet, views: Iterable[int]) -> Iterator[ViewScore]:
+def score_views(renderer: Renderer, images: ImageSet, views: Iterable[int]) -> Iterator[ViewScore]:
     """Render each view at its present pose and score it against its photo, where its pixels count."""
-    matrices = optimiser.poses.matrices().detach()
+    matrices = renderer.joint.poses.matrices().detach()
     for image in views:
-        view = render_view(optimiser, matrices[image], image, as_photo=True)
+        view = render_view(renderer, matrices[image], image, as_photo=True)
         photo = torch.from_numpy(images.image(image).astype(np.float32) / 255)
         colour = torch.from_numpy(view.colour)
         mask = images.counts_image(image)
@@ -161,12 +162,10 @@ def orbit_poses(unit_from_cam: np.ndarray, frames: int) -> np.ndarray:
     return np.stack(poses)
 
 
-def render_orbit(
-    optimiser: JointOptimiser, frames: int, after_frame: Callable[[int], None]
-) -> Iterator[np.ndarray]:
+def render_orbit(renderer: Renderer, frames: int, after_frame: Callable[[int], None]) -> Iterator[np.ndarray]:
     """Frames uint8 [h, w, 3] of a video around the scene, with the first image's intrinsics."""
-    path = orbit_poses(optimiser.poses.poses().numpy(), frames)
+    path = orbit_poses(renderer.joint.unit_from_cam, frames)
     for i, pose in enumerate(path):
-        view = render_view(optimiser, torch.from_numpy(pose), 0)
+        view = render_view(renderer, torch.from_numpy(pose), 0)
         after_frame(i)
         yield np.rint(view.colour * 255).astype(np.uint8)

@@ -23,6 +23,7 @@ from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.optimise.photo_sampler import PhotoSampler
+from biresnerf.refinement.optimise.renderer import Renderer
 from biresnerf.refinement.scene.scene_frame import scene_frame
 from biresnerf.refinement.views.evaluation import render_view
 from biresnerf.refinement.views.image_metrics import psnr, ssim
@@ -143,26 +144,28 @@ class Trial:
         """How well the field predicts the unseen views by now. The more steps, the more pixels are rendered."""
         pixels = int(sum(self.images.widths[v] * self.images.heights[v] for v in self.unseen))
         stride = max(1, math.ceil(math.sqrt(pixels / (RAYS_PER_STEP * self.optimiser.step_index))))
-        return score_unseen(self.optimiser, self.images, self.unseen, stride, COARSER)
+        return score_unseen(self.optimiser.renderer, self.images, self.unseen, stride, COARSER)
 
     def render(self, view: int) -> NDArray[np.float32]:
         """A view whole [h, w, 3], to be looked at."""
         matrices = self.optimiser.poses.matrices().detach()
-        return render_view(self.optimiser, matrices[view], view, as_photo=True, coarser=COARSER).colour
+        return render_view(
+            self.optimiser.renderer, matrices[view], view, as_photo=True, coarser=COARSER
+        ).colour
 
 
 def score_unseen(
-    optimiser: JointOptimiser, images: ImageSet, unseen: Sequence[int], stride: int, coarser: float = 1.0
+    renderer: Renderer, images: ImageSet, unseen: Sequence[int], stride: int, coarser: float = 1.0
 ) -> TrialScores:
     """How well the field predicts unseen views from where they stand, on every `stride`-th pixel across and down.
 
     Rays are marched at `coarser` times the fine interval.
     """
-    matrices = optimiser.poses.matrices().detach()
+    matrices = renderer.joint.poses.matrices().detach()
     scores = []
     for view in unseen:
         rendered = torch.from_numpy(
-            render_view(optimiser, matrices[view], view, stride=stride, as_photo=True, coarser=coarser).colour
+            render_view(renderer, matrices[view], view, stride=stride, as_photo=True, coarser=coarser).colour
         )
         photo = torch.from_numpy(images.image(view)[::stride, ::stride].astype(np.float32) / 255)
         mask = images.counts_image(view)

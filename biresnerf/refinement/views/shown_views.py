@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from biresnerf.geometry.focus import rms_spread
-from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.optimise.renderer import Renderer
 from biresnerf.refinement.views.evaluation import ViewScore
 
 Points = tuple[NDArray[np.float64], NDArray[np.uint8]]  # positions [n, 3] and colours [n, 3]
@@ -42,7 +42,7 @@ def spread_views(world_from_cam: NDArray[np.float64], chosen: list[int], count: 
 
 
 @torch.no_grad()
-def surface_of(optimiser: JointOptimiser, score: ViewScore) -> Points:
+def surface_of(renderer: Renderer, score: ViewScore) -> Points:
     """Where rays of a rendered view end, in the unit frame, and the colours there; some 2,500 at most."""
     height, width = score.view.opacity.shape
     stride = max(1, math.ceil(math.sqrt(height * width / POINTS_A_VIEW)))
@@ -50,11 +50,11 @@ def surface_of(optimiser: JointOptimiser, score: ViewScore) -> Points:
     depth, opacity = score.view.depth[rows, columns], score.view.opacity[rows, columns]
     seen = (opacity > OPAQUE) & np.isfinite(depth)
     rows, columns, depth = rows[seen], columns[seen], depth[seen]
-    xy = torch.from_numpy(np.stack([columns, rows], -1) + 0.5).float().to(optimiser.device)
-    index = torch.full((len(xy),), score.image, device=optimiser.device)
-    matrix = optimiser.poses.matrices().detach()[score.image].float().expand(len(xy), 3, 4)
-    origin, direction = (part.double().cpu().numpy() for part in optimiser.cast(matrix, index, xy))
+    xy = torch.from_numpy(np.stack([columns, rows], -1) + 0.5).float().to(renderer.device)
+    index = torch.full((len(xy),), score.image, device=renderer.device)
+    matrix = renderer.joint.poses.matrices().detach()[score.image].float().expand(len(xy), 3, 4)
+    origin, direction = (part.double().cpu().numpy() for part in renderer.cast(matrix, index, xy))
     points = origin + depth[:, None].astype(np.float64) * direction
-    near = np.linalg.norm(points, axis=1) <= REACH * optimiser.frame.distance
+    near = np.linalg.norm(points, axis=1) <= REACH * renderer.joint.frame.distance
     colours = np.rint(255 * score.view.colour[rows, columns]).astype(np.uint8)
     return points[near], colours[near]

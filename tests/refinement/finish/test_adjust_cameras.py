@@ -152,7 +152,8 @@ def test_methods_of_others_are_left_alone(tmp_path, rng):
 def test_a_field_without_surface_gives_no_patches(tmp_path, rng):
     run, _ = begun(tmp_path, rng)
     intrinsics = lenses(run.scene.dataset)
-    assert photo_patches(run.scene, run.optimiser, intrinsics, intrinsics, np.ones(VIEWS, np.bool_)) is None
+    renderer, options, placed = run.optimiser.renderer, run.optimiser.options, np.ones(VIEWS, np.bool_)
+    assert photo_patches(run.scene, renderer, options, intrinsics, intrinsics, placed) is None
 
 
 def test_a_lost_camera_is_placed_by_its_matches_and_adjusted_with_the_others(tmp_path, rng):
@@ -292,7 +293,8 @@ def test_no_field_is_trained_where_cameras_moved_by_less_than_photos_show(tmp_pa
     work = photo_check(run.optimiser.options, unbounded=run.optimiser.frame.unbounded)
     for deviation, expected in ((1e-4, []), (0.1, [((1.0,), work)])):
         other = disturbed(present, rng, deviation, deviation)
-        assert not photo_trial.photos_object(*run.parts, Rig(other, seen_by))
+        joint, recipe = run.optimiser.joint, run.optimiser.recipe
+        assert not photo_trial.photos_object(run.scene, joint, recipe, run.state, Rig(other, seen_by))
         assert trained == expected, "and it is known how long that takes"
         assert not forecast.left.get("checking")
 

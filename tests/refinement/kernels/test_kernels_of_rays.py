@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from biresnerf.refinement.optimise.camera_errors import CameraErrors
-from biresnerf.refinement.optimise.cast_rays import cast_rays, turned
+from biresnerf.refinement.optimise.renderer import cast_rays, turned
 from biresnerf.refinement.parameters.pose_parameters import PoseParameters
 from tests.refinement.tiny_scene import photos_set
 

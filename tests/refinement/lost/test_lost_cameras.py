@@ -193,8 +193,8 @@ def test_the_report_names_those_that_stay_lost_and_those_repaired(scene, tmp_pat
     finished(run)
     run.optimiser.camera_errors._stood_out[TURNED] = 2
     run.repair.repaired = [ORBITED]
-    dataset = scene[0]
-    known = pose_uncertainty(dataset, run.optimiser, Finish(), None)
+    dataset, lost = scene[0], run.optimiser.camera_errors.lost.numpy()
+    known = pose_uncertainty(dataset, run.optimiser.joint, Finish(), None, lost)
     found = Findings(uncertainty=known)
     partial = run_report(run.scene, run.optimiser, run.state.record, run.repair.repaired, found)
     report = write_result(OutputFolder(tmp_path), run.scene, run.optimiser, Monitor(), Evaluation(), partial)

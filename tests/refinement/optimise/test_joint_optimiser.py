@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from biresnerf.field.radiance_field import PositionGradient
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.refinement.views.evaluation import render_view
 from tests.refinement.tiny_scene import tiny_optimiser, tiny_options, tiny_set
@@ -25,8 +24,8 @@ def look(optimiser) -> torch.Tensor:
     image = torch.arange(len(optimiser.poses)).repeat(40)
     xy = torch.rand(len(image), 2, generator=generator) * 24
     with torch.no_grad():
-        origin, direction = optimiser.cast(optimiser.poses.matrices()[image], image, xy)
-        r = optimiser.render(origin, direction, 0, 0.02, PositionGradient(), jitter=False)
+        renderer = replace(optimiser.renderer, marching=optimiser.marching(0.02))
+        r = renderer.render(*renderer.cast(optimiser.poses.matrices()[image], image, xy))
     return torch.cat([r.colour, r.opacity[:, None], r.depth[:, None]], 1)
 
 
@@ -149,12 +148,12 @@ def test_a_set_of_several_lenses_with_one_that_sees_behind_itself_is_optimised_a
     cameras = (behind, bent, *images.cameras[2:])
     optimiser = tiny_optimiser(dataset, replace(images, cameras=cameras), tiny_options())
     image, corner = torch.tensor([0, 1, 2]), torch.full((3, 2), 0.5)
-    _, direction = optimiser.cast(optimiser.poses.matrices()[image], image, corner)
+    _, direction = optimiser.renderer.cast(optimiser.poses.matrices()[image], image, corner)
     forward = optimiser.poses.matrices()[:3, :, 2].detach()
     assert [float(c) > 0 for c in (direction.detach() * forward).sum(1)] == [False, True, True]
     for _ in range(5):
         assert np.isfinite(optimiser.step().loss)
     assert bool(optimiser.poses.matrices().isfinite().all())
-    view = render_view(optimiser, optimiser.poses.matrices()[0].detach(), 0)
+    view = render_view(optimiser.renderer, optimiser.poses.matrices()[0].detach(), 0)
     assert view.colour.shape == (24, 24, 3)
     assert np.isfinite(view.colour).all()

@@ -124,7 +124,7 @@ def test_a_run_does_not_depend_on_what_is_masked(spoilt_twice, monkeypatch):
                 optimiser.start_reconstruction()
             optimiser.step()
         fit_held_out_poses(optimiser, [3])
-        score = next(score_views(optimiser, images, [3]))
+        score = next(score_views(optimiser.renderer, images, [3]))
         results.append((optimiser.poses.poses().numpy(), score.psnr, score.ssim))
     (poses, *scores), (other_poses, *other_scores) = results
     assert np.array_equal(poses, other_poses)

@@ -17,6 +17,7 @@ from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam
 from biresnerf.geometry.camera.camera_models import FAMILY_MODELS, MODEL_PARAMETERS, Camera
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.methods import Recipe
+from biresnerf.refinement.optimise.renderer import turned, viewing_directions
 from biresnerf.refinement.parameters.intrinsics_parameters import (
     COLUMNS,
     FOCAL,
@@ -115,10 +116,9 @@ def test_gradients_of_the_rays_by_every_parameter_are_those_of_finite_difference
         with torch.no_grad():
             return (directions_in_cam(lenses.differentiable(), image, xy) * weight).sum()
 
-    optimiser = JointOptimiser.__new__(JointOptimiser)  # for its way of casting rays alone
-    optimiser.directions, optimiser.lenses = directions_in_cam, lenses
     matrix = torch.eye(3, 4, dtype=torch.float64).expand(4, 3, 4)
-    _, direction = optimiser.cast(matrix.float(), image, xy.float(), lenses.differentiable())
+    in_cam = viewing_directions(directions_in_cam, lenses.differentiable(), image, xy.float())
+    _, direction = turned(matrix.float(), in_cam)
     (direction.double() * weight).sum().backward()
     for column in range(COLUMNS):
         kept = float(lenses.increments[0, column].detach())

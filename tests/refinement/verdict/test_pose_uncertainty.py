@@ -26,7 +26,8 @@ def generator():
 
 
 def known_of(run, finish, judgement=None):
-    return pose_uncertainty(run.scene.dataset, run.optimiser, finish, judgement)
+    joint, lost = run.optimiser.joint, run.optimiser.camera_errors.lost.numpy()
+    return pose_uncertainty(run.scene.dataset, joint, finish, judgement, lost)
 
 
 def noisy_run(folder, rng):
@@ -41,7 +42,7 @@ def test_errors_in_the_callers_frame_and_unit_are_within_the_bounds(tmp_path, rn
     run, truth = noisy_run(tmp_path, rng)
     known = known_of(run, adjusted(run))
     assert {each.known_from for each in known} == {"matches"}
-    poses = RefinedPoses.now(run.scene.dataset, run.optimiser).world_from_cam
+    poses = RefinedPoses.now(run.scene.dataset, run.optimiser.joint).world_from_cam
     errors = pose_error(poses, truth).aligned
     for figure, limit in (
         (errors.rotation_deg, [each.rotation_deg for each in known]),
@@ -57,7 +58,7 @@ def test_errors_in_the_callers_frame_and_unit_are_within_the_bounds(tmp_path, rn
 def test_errors_along_the_axes_of_the_callers_world_are_as_large_as_the_covariance_says(tmp_path, rng):
     run, truth = noisy_run(tmp_path, rng)
     matrices = np.array([each.covariance for each in known_of(run, adjusted(run))])
-    poses = RefinedPoses.now(run.scene.dataset, run.optimiser).world_from_cam
+    poses = RefinedPoses.now(run.scene.dataset, run.optimiser.joint).world_from_cam
     frame = align_by_spread(truth, poses)
     errors = Cameras.of(frame.apply_to_poses(truth)).apart(Cameras.of(poses)).reshape(-1, 6)
     squares = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(matrices), errors)

@@ -10,6 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from biresnerf.data.synthetic.scene import synthetic_cameras
+from biresnerf.refinement.optimise.renderer import Renderer
 from biresnerf.refinement.views import evaluation
 from biresnerf.refinement.views.evaluation import fit_held_out_poses, orbit_poses, render_view, score_views
 from biresnerf.refinement.views.held_out_views import held_out_views
@@ -119,32 +120,29 @@ def trained(tmp_path_factory):
 
 def test_a_whole_view_has_every_pixel_once_in_its_place(trained):
     optimiser, images = trained
-    view = render_view(optimiser, optimiser.poses.matrices().detach()[2], 2)
+    view = render_view(optimiser.renderer, optimiser.poses.matrices().detach()[2], 2)
     assert view.colour.shape == (*images.image(2).shape[:2], 3)
     assert view.depth.shape == view.opacity.shape == images.image(2).shape[:2]
     assert 0 <= view.colour.min() <= view.colour.max() <= 1
     # One pixel by itself: the same ray gives the same colour.
     with torch.no_grad():
         matrix = optimiser.poses.matrices()[2:3]
-        origin, direction = optimiser.cast(matrix, torch.tensor([2]), torch.tensor([[17.5, 6.5]]))
-        alone = optimiser.render(
-            origin, direction, 0, optimiser.schedule.fine_interval, optimiser.schedule.position_gradient(0, None),
-            jitter=False,
-        )  # fmt: skip
+        renderer = optimiser.renderer
+        alone = renderer.render(*renderer.cast(matrix, torch.tensor([2]), torch.tensor([[17.5, 6.5]])))
     np.testing.assert_allclose(view.colour[6, 17], alone.colour[0].numpy(), atol=1e-6)
 
 
 def test_a_young_field_looks_the_same_at_coarser_intervals(trained, monkeypatch):
     optimiser, _ = trained
-    matrix, samples, render = optimiser.poses.matrices().detach()[2], [], optimiser.render
+    matrix, samples, render = optimiser.poses.matrices().detach()[2], [], Renderer.render
 
     def counted(*rays, **how):
         rendering = render(*rays, **how)
         samples.append(rendering.samples)
         return rendering
 
-    monkeypatch.setattr(optimiser, "render", counted)
-    fine, coarse = (render_view(optimiser, matrix, 2, coarser=times).colour for times in (1.0, 2.0))
+    monkeypatch.setattr(Renderer, "render", counted)
+    fine, coarse = (render_view(optimiser.renderer, matrix, 2, coarser=times).colour for times in (1.0, 2.0))
     assert samples[1] < 0.6 * samples[0]
     assert -10 * np.log10(((fine - coarse) ** 2).mean()) > 40
 
@@ -183,15 +181,15 @@ def test_exposures_of_held_out_views_whose_poses_are_held_are_fitted_to_one_rend
     true = torch.tensor([0.9, 1.1, 0.85])
     with torch.no_grad():
         first.exposure.log_gain[3] = true.log()
-    shown = render_view(first, first.poses.matrices().detach()[3], 3, as_photo=True).colour
+    shown = render_view(first.renderer, first.poses.matrices().detach()[3], 3, as_photo=True).colour
     pixels = images.pixels.copy()
     pixels[int(images.offsets[3]) : int(images.offsets[4])] = np.rint(255 * shown).reshape(-1, 3)
     optimiser = tiny_optimiser(dataset, replace(images, pixels=pixels), options, held_out=[3])
     optimiser.load_state(first.state(), first.step_state())
     optimiser.exposure.forget(3)
     optimiser.poses_held, poses = True, optimiser.poses.matrices().detach().clone()
-    calls, render = [], optimiser.render
-    monkeypatch.setattr(optimiser, "render", lambda *rays, **how: calls.append(how) or render(*rays, **how))
+    calls, render = [], Renderer.render
+    monkeypatch.setattr(Renderer, "render", lambda *rays, **how: calls.append(how) or render(*rays, **how))
     fit_held_out_poses(optimiser, [3])
     assert torch.equal(optimiser.poses.matrices().detach(), poses)
     assert len(calls) == 1
@@ -200,7 +198,7 @@ def test_exposures_of_held_out_views_whose_poses_are_held_are_fitted_to_one_rend
 
 def test_scores_compare_the_render_of_each_view_with_its_own_photo(trained):
     optimiser, images = trained
-    scores = list(score_views(optimiser, images, [1, 3]))
+    scores = list(score_views(optimiser.renderer, images, [1, 3]))
     assert [score.image for score in scores] == [1, 3]
     for score in scores:
         photo = images.image(score.image) / 255

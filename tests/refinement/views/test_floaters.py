@@ -42,7 +42,8 @@ def optimiser_of(images, formula, held_out=()) -> JointOptimiser:
 
 
 def share(optimiser: JointOptimiser, image: int) -> float:
-    return unshared_opacity(optimiser, optimiser.poses.matrices().detach()[image], image)
+    pose, held_out = optimiser.poses.matrices().detach()[image], optimiser.camera_errors.held_out
+    return unshared_opacity(optimiser.renderer, held_out, pose, image)
 
 
 def wall(z: float):
@@ -84,7 +85,8 @@ def test_an_empty_view_has_none(images):
 
 def test_the_report_has_its_mean_over_held_out_views(images):
     optimiser = optimiser_of(images, wall(1.0), held_out=[2, 3])
-    scores = list(score_views(optimiser, images, [2, 3]))
+    scores = list(score_views(optimiser.renderer, images, [2, 3]))
     assert share(optimiser, 2) != share(optimiser, 3)
     mean = (share(optimiser, 2) + share(optimiser, 3)) / 2
-    assert held_out_report(optimiser, scores).unshared_opacity == pytest.approx(mean)
+    found = held_out_report(optimiser.renderer, optimiser.camera_errors.held_out, scores)
+    assert found.unshared_opacity == pytest.approx(mean)
