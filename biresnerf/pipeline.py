@@ -53,7 +53,6 @@ from biresnerf.refinement.views.held_out_views import held_out_views
 from biresnerf.report import Report
 from biresnerf.resume import earlier_work, refuse_other_run, reusable_seeding, run_origin
 from biresnerf.stages import Stage
-from biresnerf.uncertainty import PoseUncertainty
 from biresnerf.write.output_folder import OutputFolder
 from biresnerf.write.preview import SeedingPreview, write_preview
 from biresnerf.write.result import ResultPictures, write_result
@@ -138,10 +137,8 @@ def _refine(input: str | Path | Dataset, setup: _Setup, observer: Observer, star
         if judgement is not None:
             shown = pictures.write_before_after(evaluation.views, judgement.renders)
             evaluation = replace(evaluation, views=shown)
-        known: tuple[PoseUncertainty, ...] = ()
-        if optimiser.method.uncertainty:
-            lost = optimiser.camera_errors.lost.cpu().numpy()
-            known = pose_uncertainty(scene.dataset, optimiser.joint, finish, judgement, lost)
+        lost, told = optimiser.camera_errors.lost.cpu().numpy(), optimiser.method.uncertainty
+        known = pose_uncertainty(scene.dataset, optimiser.joint, finish, judgement, lost) if told else ()
         found = Findings(evaluation.scores, judgement, finish, known)
         report = run_report(scene, optimiser, run.record, repair.repaired, found)
         report = write_result(setup.folder, scene, optimiser, setup.monitor, evaluation, report)

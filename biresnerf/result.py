@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.data.formats.codec import WriteContext
 from biresnerf.data.formats.colmap.write_binary import write_colmap_binary
 from biresnerf.data.formats.result_formats import export_result, read_result
@@ -36,7 +37,6 @@ from biresnerf.viewer.report_html import read_report
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Array = NDArray[np.float64]
 
 _UNKNOWN_POSE = np.full((4, 4), np.nan)
 FRUSTUM = 0.08  # depth of a drawn camera, of the cameras' spread

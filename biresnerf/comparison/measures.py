@@ -11,9 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from biresnerf.arrays import Array
 from biresnerf.comparison.conclusion import ComparedFigure, Side
 from biresnerf.data.formats.simple.poses_json import PosesDocument
-from biresnerf.judging.compare import FITS_BELOW, MATCH_ERRORS, UNSEEN_PSNR, Array, compare, octaves
+from biresnerf.judging.compare import FITS_BELOW, MATCH_ERRORS, UNSEEN_PSNR, compare, octaves
 from biresnerf.report import Finding, ImageReport, Report, Verdict
 
 FEWEST = 3  # photos that a measure needs in both results
@@ -99,10 +100,8 @@ def _matches(first: Result, second: Result, pairs: _Pairs) -> ComparedFigure | N
         index = 0 if side == "first" else 1
         result, evidence = (first, second)[index], sets[index]
         own = (evidence is not None and evidence.independent) or (result.kept_input and _given(result))
-        if (
-            float(np.median([values[index][n] / sizes[index][name] for n, name in enumerate(names)]))
-            > FITS_BELOW
-        ):
+        shares = [values[index][n] / sizes[index][name] for n, name in enumerate(names)]
+        if float(np.median(shares)) > FITS_BELOW:
             side, note = "open", "the matches fit neither result"
         elif not own:
             side, note = "open", f"the poses of the {side} result come from these matches"

@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.comparison.conclusion import PoseDifference
 from biresnerf.data.formats.simple.poses_json import PoseImage, PosesDocument
 from biresnerf.geometry.focus import rms_spread
 from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.geometry.similarity import align_robust
 from biresnerf.uncertainty import PoseUncertainty
-
-Array = NDArray[np.float64]
 
 # Nine of ten errors are within a bound, so chance all but never takes a pose beyond three.
 FAR_BOUNDS = 3.0

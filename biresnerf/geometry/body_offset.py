@@ -12,12 +12,10 @@ from dataclasses import dataclass, field
 from itertools import permutations, product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.geometry.rigid import rigid_inverse, rotation_of, rotation_vectors
 from biresnerf.geometry.similarity import Similarity, align_robust
-
-Array = NDArray[np.float64]
 
 FRAME, TURN = 7, 3  # unknowns
 LEAST_CAMERAS = 5

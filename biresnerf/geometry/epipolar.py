@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from biresnerf.arrays import Array
 
 # Sines: with a baseline or ray component this short, the epipolar plane is determined by rounding errors.
 _DEGENERATE = 1e-9

@@ -12,14 +12,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from biresnerf.arrays import Array
 from biresnerf.frozen_model import FrozenModel
 from biresnerf.geometry.focus import focus_point, rms_spread
 from biresnerf.geometry.similarity import Similarity, align_by_spread, align_robust, align_row_flip
-
-Array = NDArray[np.float64]
 
 # Mean camera distance of the Blender rigs that published tables are in.
 _TABLE_DISTANCE = 4.0

@@ -13,10 +13,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.geometry.lie import hat, so3_exp
 from biresnerf.geometry.similarity import nearest_rotation
-
-Array = NDArray[np.float64]
 
 SAMPLES = 512  # of three points: with half of them wrong, one in eight is good
 LEAST_POINTS = 6  # that must agree: three fit any camera, and a fourth now and then

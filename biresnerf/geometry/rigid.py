@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from biresnerf.arrays import Array
 
 
 def rigid_inverse(b_from_a: Array) -> Array:

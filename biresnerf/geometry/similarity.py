@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.geometry.focus import rms_spread
 from biresnerf.report import SimilarityReport
-
-Array = NDArray[np.float64]
 
 # Centres whose correlation across a line is below this share of that along it leave the turn about the line
 # to the cameras' rotations. A spread of one hundredth of the length gives 1e-4.

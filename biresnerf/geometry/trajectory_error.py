@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from biresnerf.arrays import Array
 from biresnerf.frozen_model import FrozenModel
 from biresnerf.geometry.pose_error import rotation_angle_deg, rotation_between_deg
 from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.geometry.similarity import Similarity, align_by_spread
 
-Array = NDArray[np.float64]
 THRESHOLDS_DEG = (0.5, 1, 3, 5, 10)
 WRONG_DEG = 180.0  # what a pair counts as of which a camera was not placed, as in COLMAP's benchmark
 # Two centres closer than this share of the rig's size have no direction from one to the other.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from biresnerf.arrays import Array
 
 ROUNDS = 12  # of reweighting; steps fall below 1e-9 of the depth well before
 CAUCHY_PX = 1.0  # residuals beyond this lose weight

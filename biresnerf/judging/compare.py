@@ -10,11 +10,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.report import Finding, PairedDifference
-
-Array = NDArray[np.float64]
 
 # Student's t, two-sided at 95 %, for 1 to 30 degrees of freedom; from there on 1.96 + 2.5 / degrees is near enough.
 STUDENT = (

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from biresnerf.arrays import Array
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.formats.simple.poses_json import POSES, matrix_of, read_poses_json
 from biresnerf.data.photos.images import load_images
@@ -18,7 +19,6 @@ from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.viewer.report_html import read_report
 
-Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 PHOTO_PX = 192  # long side of a photo in its frustum
 _NO_POSE = np.full((4, 4), np.nan)

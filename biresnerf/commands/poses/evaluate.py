@@ -13,8 +13,8 @@ from biresnerf.commands.answers import print_json
 from biresnerf.errors import InputError
 
 if TYPE_CHECKING:
+    from biresnerf.arrays import Array
     from biresnerf.commands.poses.error_table import Measured
-    from biresnerf.geometry.pose_error import Array
 
 SHARED_POINTS = 5  # that two photos have in common if they share a view, as in COLMAP's benchmark
 

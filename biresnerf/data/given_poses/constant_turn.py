@@ -9,12 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.data.given_poses.matched_details import MatchedPair, off_by
 from biresnerf.data.model.conventions import rotation_from_quat_wxyz
-
-Array = NDArray[np.float64]
 
 TURNS = 2000  # about 15 degrees apart
 DETAILS = 12  # of a pair, at most

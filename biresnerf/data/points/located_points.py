@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.measured_places import ControlPoints
 from biresnerf.geometry.camera.camera_models import Camera
@@ -20,7 +21,6 @@ from biresnerf.geometry.triangulation import triangulate
 
 logger = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 
 LEAST_POINTS = 3
 # A point is far off by so many medians of the others' distances, px of its photos and stated deviations; or by so many

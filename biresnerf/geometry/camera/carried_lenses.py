@@ -13,9 +13,8 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from biresnerf.arrays import Array
 
 # What each has beside focal lengths and the principal point.
 SHAPES = {"FOV": ("omega",), "SIMPLE_DIVISION": ("k",), "DIVISION": ("k",), "EUCM": ("alpha", "beta")}

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from biresnerf.arrays import Array
 
 # WGS84 (NIMA TR8350.2): the ellipsoid's semi-major axis, m, and flattening.
 SEMI_MAJOR_AXIS, FLATTENING = 6_378_137.0, 1 / 298.257223563

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.geometry.similarity import Similarity, align_robust
-
-Array = NDArray[np.float64]
 
 # Positions give a frame if there are so many, and if they scatter about the cameras by less than this share of how far
 # they spread along their second axis: the turn about the first is off by about as many radians, over the root of their

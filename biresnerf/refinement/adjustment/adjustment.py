@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_by_spread
 from biresnerf.refinement.adjustment.cameras import POSE, Cameras
@@ -26,8 +26,6 @@ from biresnerf.refinement.adjustment.solver.covariance import covariance, of_eac
 from biresnerf.refinement.adjustment.solver.solve import Prior, minimise, normal_equations
 from biresnerf.refinement.adjustment.solver.term import Term
 from biresnerf.refinement.adjustment.track_term import ROBUST_SCALE, TrackTerm
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

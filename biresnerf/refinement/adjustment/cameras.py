@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.lie import so3_exp, so3_log
 from biresnerf.geometry.similarity import nearest_rotation
@@ -20,8 +21,6 @@ from biresnerf.refinement.adjustment.lens.lenses import (
     Lenses,
     slopes_seen,
 )
-
-Array = NDArray[np.float64]
 
 # Of the cameras' mean distance from their middle. A wrong match may put its point right before a camera, where the
 # residual changes without bound.

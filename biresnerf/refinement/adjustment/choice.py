@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.judging.compare import LEFT_OUT, compare, octaves
 from biresnerf.refinement.adjustment.lens.lenses import Lenses
 from biresnerf.report import CandidateName, CandidateReport, Finding
 
 logger = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 
 _LEAST = 1e-6  # of a misfit, in squared noise levels: nothing fits better than that
 

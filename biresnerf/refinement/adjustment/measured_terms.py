@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.data.points.located_points import MOST_FAR_OFF, far_off
 from biresnerf.geometry.body_offset import SHARED_ERRORS
 from biresnerf.geometry.camera.camera import Intrinsics
@@ -17,8 +18,6 @@ from biresnerf.refinement.adjustment.cameras import POSE, Cameras
 from biresnerf.refinement.adjustment.evidence import Control, Evidence, Positions
 from biresnerf.refinement.adjustment.solver.term import Linearised
 from biresnerf.refinement.adjustment.track_term import RAYLEIGH_MEDIAN, ROBUST_SCALE, TrackTerm
-
-Array = NDArray[np.float64]
 
 FINEST_M = 1e-3  # no position is as exact
 MARKED_PX = 0.5  # nobody marks a point in a photo more exactly

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.refinement.adjustment.evidence import Patches, PatchPhotos
 from biresnerf.refinement.adjustment.splines import blurred
-
-Array = NDArray[np.float64]
 
 # A patch's pixels about its middle one, as in Direct Sparse Odometry (Engel et al. 2018), made symmetric.
 PATTERN = np.array([[0, 0], [-2, 0], [2, 0], [0, -2], [0, 2], [-1, -1], [1, 1], [-1, 1]])

@@ -8,6 +8,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.refinement.adjustment.cameras import Cameras, lens_rows
 from biresnerf.refinement.adjustment.evidence import Patches
@@ -20,7 +21,6 @@ from biresnerf.refinement.adjustment.kernels.patches import (
 from biresnerf.refinement.adjustment.solver.in_parts import in_parts
 from biresnerf.refinement.adjustment.solver.term import Linearised
 
-Array = NDArray[np.float64]
 Seen = tuple[object, ...]  # what all kernels read
 Result = TypeVar("Result")
 

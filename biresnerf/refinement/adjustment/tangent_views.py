@@ -8,11 +8,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam, project
 from biresnerf.refinement.adjustment.cameras import LENS_ROW, SHOWN_ROW, Cameras
 from biresnerf.refinement.adjustment.lens.fisheyes import moved_by_lens, with_corrections
-
-Array = NDArray[np.float64]
 
 _STEP = 1e-4  # rad, of the differences that say how large a fisheye shows things
 

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam
 from biresnerf.geometry.triangulation import triangulate
@@ -20,8 +21,6 @@ from biresnerf.refinement.adjustment.lens.fisheyes import with_corrections
 from biresnerf.refinement.adjustment.solver.in_parts import in_parts
 from biresnerf.refinement.adjustment.solver.term import Linearised
 from biresnerf.refinement.adjustment.tangent_views import TangentViews
-
-Array = NDArray[np.float64]
 
 # Residuals of this many noise levels have lost three quarters of their weight: what is beyond is taken to be wrong.
 ROBUST_SCALE = 3.0

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.geometry.similarity import align_robust
@@ -21,7 +21,6 @@ from biresnerf.report import CandidateName
 
 logger = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 
 # On a tie the earlier is kept: the input's poses, unless the evidence cannot tell.
 ORDER: tuple[CandidateName, ...] = (

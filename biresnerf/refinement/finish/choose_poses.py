@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.rigid_bodies import RigidBodies
@@ -41,12 +42,9 @@ from biresnerf.report import CandidateName
 
 logger = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 
-OF_MATCHES: tuple[CandidateName, ...] = (
-    "input",
-    "matched",
-)  # as COLMAP left them: the input's, of photos alone
+# As COLMAP left them: the input's, of photos alone.
+OF_MATCHES: tuple[CandidateName, ...] = ("input", "matched")
 SAME_POSES = 1e-6
 # Of tracks, in px or in shares of the photos' size. Sets have 0.1 to 0.5 px.
 MOST_NOISE_PX, MOST_NOISE = 2.0, 0.002
@@ -134,9 +132,7 @@ def _adjusted(
 
 
 def _believes_control(found: Adjustment, evidence: Evidence) -> bool:
-    lenses = evidence.lenses
-    if lenses is not None and found.lenses is not None:
-        lenses = replace(lenses, correction=found.lenses.correction)
+    lenses = heeded("adjusted", found, evidence).lenses
     return control_believed(evidence, Cameras.of(found.world_from_cam, lenses))
 
 

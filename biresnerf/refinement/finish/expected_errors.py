@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.geometry.similarity import Similarity, align_by_spread
 from biresnerf.refinement.adjustment.adjustment import patch_term, track_term
@@ -20,8 +21,6 @@ from biresnerf.refinement.adjustment.solver.covariance import (
     without_lenses,
 )
 from biresnerf.refinement.adjustment.solver.solve import ROUNDS, SETTLED
-
-Array = NDArray[np.float64]
 
 # Root mean square errors (rad) beyond this are not known: the poses' errors are no longer linear in the residuals.
 MOST_ROTATION = 0.1

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.points.located_points import located
 from biresnerf.data.points.tracks import Tracks
@@ -21,8 +22,6 @@ from biresnerf.refinement.finish.photo_evidence import photo_patches
 from biresnerf.refinement.optimise.renderer import Renderer
 from biresnerf.refinement.parameters.joint_parameters import JointParameters
 from biresnerf.refinement.scene.scene import Scene
-
-Array = NDArray[np.float64]
 
 # Of tracks: in candidates, and in what is returned. On scarf 21,000 of 133,000 leave 0.090 deg, all of them 0.048.
 MOST_OBSERVATIONS, MOST_IN_THE_END = 40_000, 200_000

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.geometry.body_offset import EXACT, SHARED_ERRORS, BodyOffset, tie
 from biresnerf.geometry.focus import rms_spread
@@ -20,7 +21,6 @@ from biresnerf.uncertainty import InputAccuracy
 
 logger = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 
 LEAST_CAMERAS = 6
 UNDERSTATED = 3.0  # errors so many times as large as stated are worth a warning

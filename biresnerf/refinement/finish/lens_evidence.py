@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.data.model.dataset import Dataset, IntrinsicsSource
 from biresnerf.geometry.camera.camera_models import REFINED_PARAMETERS, Camera
 from biresnerf.geometry.camera.lens import lens_problem
@@ -27,8 +27,6 @@ from biresnerf.refinement.adjustment.lens.lenses import (
     Lenses,
 )
 from biresnerf.refinement.parameters.intrinsics_parameters import FocalCertainty
-
-Array = NDArray[np.float64]
 
 # Standard deviation of a focal length, as a share of it, by who found it. Guesses: over 13 sets of photos of all kinds,
 # the logarithm of the focal length over the guess (1.2 of the long side) has 0.4. What COLMAP found says nothing

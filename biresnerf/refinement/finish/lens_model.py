@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.geometry.camera.camera_models import REFINED_PARAMETERS, Camera
 from biresnerf.judging.compare import FREER_LENS, is_better
 from biresnerf.refinement.adjustment.adjustment import Adjustment, adjust_poses, track_term
@@ -21,7 +22,6 @@ from biresnerf.refinement.finish.expected_errors import TRACK_MODEL_ERROR
 
 logger = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 
 MOST_OBSERVATIONS = 20_000  # more tell the same
 

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
+from biresnerf.arrays import Array
 from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.geometry.similarity import Similarity
 from biresnerf.refinement.adjustment.adjustment import Adjustment
@@ -17,8 +15,6 @@ from biresnerf.refinement.finish.candidates import ORDER, usable
 from biresnerf.refinement.finish.expected_errors import ExpectedErrors, expected_errors
 from biresnerf.refinement.finish.given_poses import GivenPoses
 from biresnerf.report import CandidateName, CandidateReport
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,14 +74,9 @@ def heeded(name: CandidateName, found: Adjustment, evidence: Evidence) -> Eviden
     lenses = evidence.lenses
     if lenses is not None and found.lenses is not None:
         lenses = replace(lenses, correction=found.lenses.correction)
-    return Evidence(
-        evidence.intrinsics,
-        evidence.tracks if name != "adjusted-patches" else None,
-        evidence.patches if name != "adjusted-tracks" else None,
-        lenses,
-        evidence.positions,
-        evidence.control,
-    )
+    tracks = evidence.tracks if name != "adjusted-patches" else None
+    patches = evidence.patches if name != "adjusted-tracks" else None
+    return replace(evidence, tracks=tracks, patches=patches, lenses=lenses)
 
 
 def fit_of(

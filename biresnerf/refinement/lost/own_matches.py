@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.camera.camera_models import Camera
@@ -16,8 +17,6 @@ from biresnerf.geometry.triangulation import parallax_deg, triangulate
 from biresnerf.judging.compare import ANY_GAIN, is_better, octaves
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.scene.scene_depth import track_rays
-
-Array = NDArray[np.float64]
 
 LEAST_PAIRS = 8  # of an image's observations with others; fewer say nothing of it
 LEAST_PX = 0.05  # errors below it are equal: features are not that exact

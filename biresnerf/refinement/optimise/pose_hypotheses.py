@@ -6,12 +6,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.data.photos.area_resize import area_resize
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.geometry.lie import so3_exp
 from biresnerf.geometry.similarity import align_robust
-
-Array = NDArray[np.float64]
 
 NEIGHBOURS = 8  # cameras whose correction is tried, and cameras whose place is tried
 ORBITS_DEG = (10, 20, 30, 45, 60)

@@ -50,12 +50,7 @@ def find_forward_facing(
 
     def run(world_from_cam: NDArray[np.float64], steps: int) -> tuple[NDArray[np.float64], float]:
         """Poses after stage 1 alone, and mean PSNR of views that move their own pose, but do not train the field."""
-        short = recipe.changed(
-            steps=steps,
-            coarse_steps_min=steps // 4,
-            coarse_steps_max=steps,
-            samples_per_step=min(SAMPLES, recipe.options.samples_per_step),
-        )
+        short = recipe.apart(steps, (steps // 4, steps), SAMPLES)
         poses = frame.unit_from_world.apply_to_poses(world_from_cam)
         optimiser = JointOptimiser(images, frame, poses, short, unseen)
         for _ in range(steps):

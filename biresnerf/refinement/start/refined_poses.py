@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 
+from biresnerf.arrays import Array
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.points.located_points import metres_from_world
 from biresnerf.geometry.similarity import Similarity, align_by_spread, align_robust
 from biresnerf.refinement.parameters.intrinsics_parameters import IntrinsicsParameters
 from biresnerf.refinement.parameters.joint_parameters import JointParameters
 from biresnerf.refinement.scene.scene_frame import SceneFrame
-
-Array = NDArray[np.float64]
 
 IN_METRES = 0.01  # a scale so near one is that of measured places: others have no unit
 

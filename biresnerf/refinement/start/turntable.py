@@ -80,12 +80,7 @@ class RingTrials:
         Raises:
             Interrupted: ``should_stop`` returned true.
         """
-        short = self._recipe.changed(
-            steps=TRY_STEPS,
-            coarse_steps_min=TRY_STEPS // 4,
-            coarse_steps_max=2 * TRY_STEPS,
-            samples_per_step=min(SAMPLES, self._recipe.options.samples_per_step),
-        )
+        short = self._recipe.apart(TRY_STEPS, (TRY_STEPS // 4, 2 * TRY_STEPS), SAMPLES)
         poses = self.frame.unit_from_world.apply_to_poses(ring.matrices())
         moving = RingParameters(ring, self.frame.distance, self._run, self._recipe.device)
         optimiser = JointOptimiser(

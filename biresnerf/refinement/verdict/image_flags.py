@@ -6,11 +6,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.refinement.optimise.photo_sampler import PhotoSampler
 from biresnerf.refinement.optimise.renderer import Renderer
-
-Array = NDArray[np.float64]
 
 NEIGHBOURS = 6  # photos from the nearest places, which show about the same
 BLURRED_BELOW = 0.3  # of the neighbours' sharpness: a blur of about one px of the working size

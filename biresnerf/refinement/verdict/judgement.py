@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.data.model.dataset import GUESSES, Dataset
 from biresnerf.data.workload import JUDGING
 from biresnerf.geometry.focus import focus_point, rms_spread
@@ -51,7 +52,6 @@ from biresnerf.report import EpipolarEvidence, Finding, Verdict
 
 logger = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 
 GUESSED = GUESSES | {"forward-facing", "turntable"}
 

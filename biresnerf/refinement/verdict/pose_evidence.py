@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.judging.compare import MATCH_ERRORS, octaves, paired
 from biresnerf.refinement.lost.own_matches import LEAST_PX, OwnMatches, well_matched
 from biresnerf.refinement.views.compare_rigs import Rig
 from biresnerf.report import EpipolarEvidence
-
-Array = NDArray[np.float64]
 
 LEAST_MATCHED = 4  # images
 

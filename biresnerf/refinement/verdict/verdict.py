@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.judging.compare import FITS_BELOW
 from biresnerf.refinement.views.compare_rigs import photos_tell
 from biresnerf.report import (
@@ -22,8 +22,6 @@ from biresnerf.report import (
     Verdict,
     VerdictName,
 )
-
-Array = NDArray[np.float64]
 
 MEASURABLE_PX = 0.1  # at working size: less motion cannot be seen in photos of that size
 # Matches speak for poses only if the error that they lose is so large a share of the motion, but for one px of it:

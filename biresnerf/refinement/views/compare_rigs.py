@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.workload import LOOKS, picture_share
 from biresnerf.geometry.camera.camera_models import Camera
@@ -19,7 +20,6 @@ from biresnerf.refinement.views.image_metrics import shift_px
 from biresnerf.refinement.views.pose_trials import PoseTrials, Trial, TrialScores, joined
 from biresnerf.report import Finding, HeldOutEvidence
 
-Array = NDArray[np.float64]
 BeforeAfter = dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]]
 
 SHOWN = 4  # held-out views that are rendered with either rig, to be looked at

@@ -119,15 +119,16 @@ def render_view(
     return RenderedView(whole[..., :3].clip(0, 1), whole[..., 3], whole[..., 4])
 
 
-def score_views(renderer: Renderer, images: ImageSet, views: Iterable[int]) -> Iterator[ViewScore]:
-    """Render each view at its present pose and score it against its photo, where its pixels count."""
+def score_views(
+    renderer: Renderer, images: ImageSet, views: Iterable[int], stride: int = 1, coarser: float = 1.0
+) -> Iterator[ViewScore]:
+    """Render each view at its present pose, see `render_view`, and score it where its photo's pixels count."""
     matrices = renderer.joint.poses.matrices().detach()
     for image in views:
-        view = render_view(renderer, matrices[image], image, as_photo=True)
-        photo = torch.from_numpy(images.image(image).astype(np.float32) / 255)
-        colour = torch.from_numpy(view.colour)
-        mask = images.counts_image(image)
-        counts = None if mask is None else torch.from_numpy(mask)
+        view = render_view(renderer, matrices[image], image, stride=stride, as_photo=True, coarser=coarser)
+        photo = torch.from_numpy(images.image(image)[::stride, ::stride].astype(np.float32) / 255)
+        colour, mask = torch.from_numpy(view.colour), images.counts_image(image)
+        counts = None if mask is None else torch.from_numpy(mask[::stride, ::stride].copy())
         yield ViewScore(image, view, psnr(colour, photo, counts), ssim(colour, photo, counts))
 
 

@@ -13,7 +13,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from biresnerf.data.photos.images import ImageSet
@@ -25,8 +24,7 @@ from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.optimise.photo_sampler import PhotoSampler
 from biresnerf.refinement.optimise.renderer import Renderer
 from biresnerf.refinement.scene.scene_frame import scene_frame
-from biresnerf.refinement.views.evaluation import render_view
-from biresnerf.refinement.views.image_metrics import psnr, ssim
+from biresnerf.refinement.views.evaluation import render_view, score_views
 
 SAMPLES = 1 << 14  # a step
 ONE_IN, VIEWS_MOST = 5, 16  # unseen views: one in so many, but no more than that
@@ -81,12 +79,7 @@ class PoseTrials:
         self.steps = steps * (OPEN_STEPS if self.frame.unbounded else 1)
         # All of it stage 1, and the rates fall to their end: with the rates of a longer run's first half, trainings on
         # the same poses differ by 0.25 dB from seed to seed (lego at 100 px, 200 steps), so by 0.04.
-        self._recipe = recipe.changed(
-            steps=self.steps,
-            coarse_steps_min=self.steps,
-            coarse_steps_max=self.steps,
-            samples_per_step=min(SAMPLES, recipe.options.samples_per_step),
-        )
+        self._recipe = recipe.apart(self.steps, (self.steps, self.steps), SAMPLES)
         self._should_stop = should_stop
         self._sampler = sampler or PhotoSampler(images, self.unseen, recipe.device, recipe.method.by_detail)
 
@@ -161,15 +154,6 @@ def score_unseen(
 
     Rays are marched at `coarser` times the fine interval.
     """
-    matrices = renderer.joint.poses.matrices().detach()
-    scores = []
-    for view in unseen:
-        rendered = torch.from_numpy(
-            render_view(renderer, matrices[view], view, stride=stride, as_photo=True, coarser=coarser).colour
-        )
-        photo = torch.from_numpy(images.image(view)[::stride, ::stride].astype(np.float32) / 255)
-        mask = images.counts_image(view)
-        counts = None if mask is None else torch.from_numpy(mask[::stride, ::stride].copy())
-        scores.append((psnr(rendered, photo, counts), ssim(rendered, photo, counts)))
+    scores = [(each.psnr, each.ssim) for each in score_views(renderer, images, unseen, stride, coarser)]
     table = np.array(scores, dtype=np.float64).reshape(-1, 2)
     return TrialScores(table[:, 0], table[:, 1])

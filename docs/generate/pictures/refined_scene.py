@@ -17,9 +17,10 @@ from PIL import Image, ImageDraw
 from scipy.spatial.transform import Rotation
 
 import biresnerf
+from biresnerf.arrays import Array
 from biresnerf.commands.poses.make_scene import make_scene
 from biresnerf.data.show.view_file import read_view_file
-from biresnerf.result import Array, Result
+from biresnerf.result import Result
 
 FOLDER = Path(__file__).resolve().parents[2] / "pictures"
 CAMERAS, BEFORE_AFTER = PICTURES = (FOLDER / "cameras.webp", FOLDER / "before_after.webp")

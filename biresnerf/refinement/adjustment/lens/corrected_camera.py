@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.geometry.camera.camera_models import (
     REFINED_PARAMETERS,
     Camera,
@@ -14,8 +14,6 @@ from biresnerf.geometry.camera.distortion import coefficients_of, distort
 from biresnerf.geometry.camera.pixel_rays import rays_of_pixels
 from biresnerf.refinement.adjustment.lens.fisheyes import corrected_fisheye
 from biresnerf.refinement.adjustment.lens.lenses import ASPECT, CENTRE, DISTORTION, FOCAL
-
-Array = NDArray[np.float64]
 
 STEPS = 24  # along each side of the image, of the grid that the new lens is fitted to
 FITTED = ("k1", "k2", "p1", "p2")

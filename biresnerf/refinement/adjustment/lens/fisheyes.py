@@ -8,11 +8,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.geometry.camera.camera import ABOVE, TANGENTIAL, Intrinsics, directions_in_cam, plane_position
 from biresnerf.geometry.camera.camera_models import FullParameters
 from biresnerf.refinement.adjustment.lens.lenses import ASPECT, FOCAL, K1, K2, LENS
-
-Array = NDArray[np.float64]
 
 
 def corrected_fisheye(lens: FullParameters, correction: Array) -> FullParameters:

@@ -13,9 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.geometry.camera.distortion import Coefficients, distort, distort_jacobian
-
-Array = NDArray[np.float64]
 
 LENS = 8  # unknowns of a lens
 FOCAL, K1, K2, CENTRE, TANGENTIAL, ASPECT = 0, 1, 2, slice(3, 5), slice(5, 7), 7

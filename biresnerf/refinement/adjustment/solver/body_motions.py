@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.geometry.lie import so3_exp
 from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.refinement.adjustment.cameras import POSE, Cameras
-
-Array = NDArray[np.float64]
 
 _REPRESENTED = 1e-6  # of a common motion's length: what bodies leave of it, if they can move so
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.refinement.adjustment.cameras import POSE, Cameras
 from biresnerf.refinement.adjustment.solver.body_motions import allowed_motions, body_columns
-
-Array = NDArray[np.float64]
 
 # What is known of any camera beside the evidence: a standard deviation of one radian and one spread of the rig. It
 # keeps the system regular, and is far beyond what linear errors can mean.

@@ -9,14 +9,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from biresnerf.arrays import Array
 from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.refinement.adjustment.cameras import POSE, Cameras
 from biresnerf.refinement.adjustment.evidence import PosePrior
 from biresnerf.refinement.adjustment.lens.lenses import Lenses
 from biresnerf.refinement.adjustment.solver.body_motions import body_columns, rigid_motion
 from biresnerf.refinement.adjustment.solver.term import Linearised, Term
-
-Array = NDArray[np.float64]
 
 ROUNDS = 8  # of measuring the noise; it falls with the residuals, and with it what counts as wrong
 STEPS = 10  # of each round, at most

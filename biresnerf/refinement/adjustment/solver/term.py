@@ -5,12 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from biresnerf.arrays import Array
 from biresnerf.refinement.adjustment.cameras import Cameras
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
