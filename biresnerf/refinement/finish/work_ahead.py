@@ -79,7 +79,8 @@ def work_ahead(
     """
     unbounded = optimiser.frame.unbounded
     options = options or optimiser.schedule.options
-    coarse, fine = run.steps_left(optimiser, options.steps, options.coarse_steps_max)
+    step, switch = optimiser.step_index, optimiser.switch
+    coarse, fine = run.steps_left(step, switch, options.steps, options.coarse_steps_max)
     weights = step_weights(options, unbounded=unbounded)
     adjusts, first = adjusts_cameras(scene.dataset, optimiser.method), not run.record.adjusted
     each = adjustment(scene) if adjusts else 0.0

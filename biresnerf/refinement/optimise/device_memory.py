@@ -10,9 +10,8 @@ from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser, StepRe
 
 logger = logging.getLogger(__name__)
 
-LEAST_SHARE = (
-    1 / 16
-)  # of the samples that the options ask for; if even these do not fit, batches are not the cause
+# Of the samples that the options ask for: if even these do not fit, batches are not the cause.
+LEAST_SHARE = 1 / 16
 
 
 def step_that_fits(optimiser: JointOptimiser) -> StepResult:
@@ -33,14 +32,14 @@ def step_that_fits(optimiser: JointOptimiser) -> StepResult:
         # After the handler, as the error's traceback holds the step's tensors.
         optimiser.halve_batch()
         torch.cuda.empty_cache()
-        logger.warning("%s", smaller_batches(optimiser)[0])
+        logger.warning("%s", smaller_batches(optimiser.batch_share, optimiser.options.samples_per_step)[0])
 
 
-def smaller_batches(optimiser: JointOptimiser) -> tuple[str, ...]:
-    """A warning where the batch did not fit."""
-    if optimiser.batch_share == 1:
+def smaller_batches(share: float, samples: int) -> tuple[str, ...]:
+    """A warning where batches of so many samples did not fit, but a share of them."""
+    if share == 1:
         return ()
     return (
-        f"The GPU's memory is too small for samples_per_step={optimiser.options.samples_per_step}: steps had "
-        f"{optimiser.batch_share:.2g} of these samples. Poses may be less exact.",
+        f"The GPU's memory is too small for samples_per_step={samples}: steps had "
+        f"{share:.2g} of these samples. Poses may be less exact.",
     )

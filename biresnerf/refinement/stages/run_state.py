@@ -14,7 +14,6 @@ from biresnerf.data.show.history import History
 from biresnerf.forecast.run_forecast import Phase
 from biresnerf.progress import Monitor, Progress
 from biresnerf.refinement.lost.lost_cameras import RepairState
-from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.optimiser_state import StepState
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.checkpoint import (
@@ -78,9 +77,8 @@ class RunState:
         """Seconds to when it is to end."""
         return self.ends - time.monotonic()
 
-    def steps_left(self, optimiser: JointOptimiser, steps: int, cap: int) -> tuple[int, int]:
-        """Of stage 1, at most, and of stage 2, in a run of so many steps whose stage 1 has at most `cap`."""
-        step, switch = optimiser.step_index, optimiser.switch
+    def steps_left(self, step: int, switch: int | None, steps: int, cap: int) -> tuple[int, int]:
+        """Of stage 1, at most, and of stage 2, at a step of a run of so many whose stage 1 has at most `cap`."""
         end = steps if self.record.adjusted else max(step, round(self.monitor.forecast.share * steps))
         begin = min(cap if switch is None else switch, end)
         return max(0, begin - step), max(0, end - max(step, begin))

@@ -220,7 +220,7 @@ class TwoStages:
 
     def _progress(self, checkpoint: str | None, preview: tuple[str, ...] = ()) -> Progress:
         optimiser, steps = self.optimiser, self.optimiser.schedule.steps
-        left = self.run.steps_left(optimiser, steps, self.detector.cap)
+        left = self.run.steps_left(optimiser.step_index, optimiser.switch, steps, self.detector.cap)
         self.run.monitor.forecast.plan_steps(*left)
         losses, self._losses = self._losses, []
         reusable, self._reusable = self._reusable, {}

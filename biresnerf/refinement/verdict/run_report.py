@@ -104,7 +104,7 @@ def run_report(
         + one_place_warnings(scene.tracks, refined)
         + method_warnings(optimiser.recipe)
         + gpu_warnings(optimiser.device)
-        + smaller_batches(optimiser)
+        + smaller_batches(optimiser.batch_share, optimiser.options.samples_per_step)
         + budget_warnings(optimiser.options.time_budget_s, record.seconds)
         + _unknown_warnings(dataset, found.uncertainty),
     )

@@ -55,7 +55,7 @@ def test_a_run_without_enough_memory_ends_with_smaller_batches_and_says_so(scene
 def test_a_run_with_enough_memory_says_nothing(optimiser):
     step_that_fits(optimiser)
     assert optimiser.batch_share == 1
-    assert smaller_batches(optimiser) == ()
+    assert smaller_batches(optimiser.batch_share, 4096) == ()
 
 
 def test_what_does_not_fit_in_any_size_is_an_error(optimiser):
