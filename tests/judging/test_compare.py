@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from scipy.stats import ttest_1samp
 from biresnerf.judging import compare as rules
 from biresnerf.judging.compare import Rule, compare, is_better, octaves, paired, student_quantile
 
+ROOT = Path(__file__).resolve().parents[2]
 OPPOSITE = {"better": "worse", "worse": "better", "same": "same", "open": "open"}
 BY_CHANCE = [
     rules.UNSEEN_PSNR,
@@ -144,3 +147,15 @@ def test_a_report_has_the_figures_of_both_sets():
     found = paired(np.array([4.0, 8.0]), np.array([1.0, 2.0]), rules.MATCH_ERRORS, gains=np.array([2.0, 2.0]))
     assert (found.count, found.before, found.after, found.difference) == (2, 6.0, 1.5, 2.0)
     assert (found.low, found.high, found.finding) == (2.0, 2.0, "better")
+
+
+def test_no_other_place_makes_an_interval():
+    sources = (path for path in (ROOT / "biresnerf").rglob("*.py") if "ddof=1" in path.read_text())
+    assert [path.relative_to(ROOT).as_posix() for path in sources] == ["biresnerf/judging/compare.py"]
+
+
+def test_the_page_on_the_verdict_names_every_rule_among_the_judges():
+    page = (ROOT / "docs/verdict.md").read_text()
+    judges = page[page.index("### All judges") : page.index("## How far to trust it")]
+    named = set(re.findall(r"`([A-Z_]+)`", judges))
+    assert named == {name for name, value in vars(rules).items() if isinstance(value, Rule)}
