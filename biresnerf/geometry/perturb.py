@@ -7,7 +7,8 @@ import torch
 from numpy.typing import NDArray
 
 from biresnerf.geometry.focus import focus_point
-from biresnerf.geometry.lie import se3_exp, so3_exp
+from biresnerf.geometry.lie import se3_exp
+from biresnerf.geometry.rigid import rotation_of
 
 RIG_DISTANCE = 4.0  # of the cameras from the scene in the Blender sets that BARF's noise levels were made for
 LOST_DEG = (45.0, 180.0)
@@ -48,7 +49,7 @@ def perturb_poses(world_from_cam: NDArray[np.float64], noise: float, seed: int) 
 
 def turn_in_place(world_from_cam: NDArray[np.float64], index: int, angle_deg: float) -> NDArray[np.float64]:
     """Poses [n, 4, 4] with camera `index` turned about its own vertical axis; 180 turns it to face backwards."""
-    turn = _rotations(np.array([0.0, np.radians(angle_deg), 0.0]))
+    turn = rotation_of(np.array([0.0, np.radians(angle_deg), 0.0]))
     moved = np.array(world_from_cam, dtype=np.float64)
     moved[index, :3, :3] = moved[index, :3, :3] @ turn
     return moved
@@ -65,7 +66,7 @@ def orbit_away(world_from_cam: NDArray[np.float64], indices: list[int], seed: in
     for index in indices:
         axis = random.normal(size=3)
         angle = np.radians(random.uniform(*LOST_DEG))
-        turn = _rotations(axis / np.linalg.norm(axis) * angle)
+        turn = rotation_of(axis / np.linalg.norm(axis) * angle)
         poses[index, :3, :3] = turn @ poses[index, :3, :3]
         poses[index, :3, 3] = turn @ (poses[index, :3, 3] - focus) + focus
     return poses
@@ -85,7 +86,7 @@ def drift_like_a_phone(world_from_cam: NDArray[np.float64], seed: int) -> NDArra
     rate = np.zeros(count)
     for k in range(1, count):
         rate[k] = HEADING_KEPT * rate[k - 1] + random.normal(0.0, np.radians(HEADING_STEP_DEG))
-    heading = _rotations(up / np.linalg.norm(up) * np.cumsum(rate)[:, None])
+    heading = rotation_of(up / np.linalg.norm(up) * np.cumsum(rate)[:, None])
     steps = np.diff(poses[:, :3, 3], axis=0)
     lost = random.normal(0.0, STEP_LOST, steps.shape) * np.linalg.norm(steps, axis=1, keepdims=True)
     scale = 1.0 + random.normal(0.0, SCALE_ERROR)
@@ -93,12 +94,6 @@ def drift_like_a_phone(world_from_cam: NDArray[np.float64], seed: int) -> NDArra
     moved = poses.copy()
     moved[1:, :3, 3] = poses[0, :3, 3] + np.cumsum(walked, axis=0)
     moved[:, :3, 3] += random.normal(0.0, JITTER_OF_DISTANCE * distance, (count, 3))
-    jitter = _rotations(random.normal(0.0, np.radians(JITTER_DEG), (count, 3)))
+    jitter = rotation_of(random.normal(0.0, np.radians(JITTER_DEG), (count, 3)))
     moved[:, :3, :3] = jitter @ heading @ poses[:, :3, :3]
     return moved
-
-
-def _rotations(rotvec: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotation matrices [..., 3, 3] of rotation vectors [..., 3] (rad)."""
-    rotations: NDArray[np.float64] = so3_exp(torch.from_numpy(rotvec)).numpy()
-    return rotations

@@ -14,8 +14,8 @@ import numpy as np
 import rich
 from numpy.typing import NDArray
 
-from biresnerf.data.model.conventions import quat_wxyz_from_rotation
 from biresnerf.errors import InputError
+from biresnerf.geometry.rigid import quat_wxyz_from_rotation
 from biresnerf.live_view.state import (
     Picture,
     Seen,

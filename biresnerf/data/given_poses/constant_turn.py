@@ -12,7 +12,7 @@ import numpy as np
 
 from biresnerf.arrays import Array
 from biresnerf.data.given_poses.matched_details import MatchedPair, off_by
-from biresnerf.data.model.conventions import rotation_from_quat_wxyz
+from biresnerf.geometry.rigid import rotation_from_quat_wxyz
 
 TURNS = 2000  # about 15 degrees apart
 DETAILS = 12  # of a pair, at most
@@ -28,13 +28,13 @@ def best_turn(world_from_body: Mapping[int, Array], pairs: Sequence[MatchedPair]
         world_from_body: poses [4, 4] by the rows that pairs name.
     """
     score, rng = _scorer(world_from_body, pairs), np.random.default_rng(0)
-    turns = _rotations(rng.normal(size=(TURNS, 4)))
+    turns = rotation_from_quat_wxyz(rng.normal(size=(TURNS, 4)))
     scores = np.array([score(turn, WIDER) for turn in turns])
     found: list[tuple[float, Array]] = []
     for index in np.argsort(-scores)[:FROM]:
         turn, wide = turns[index], WIDER
         for size in STEPS:
-            near = turn @ _rotations(
+            near = turn @ rotation_from_quat_wxyz(
                 np.column_stack([np.ones(TRIES), rng.normal(size=(TRIES, 3)) * size / 2])
             )
             near = np.concatenate([turn[None], near])
@@ -73,8 +73,3 @@ def _scorer(
         return float(shares[0] - shares[1])
 
     return score
-
-
-def _rotations(quaternions: Array) -> Array:
-    """Rotation matrices [n, 3, 3] of quaternions (w, x, y, z) [n, 4] of any length."""
-    return np.stack([rotation_from_quat_wxyz(each) for each in quaternions])

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from biresnerf.data.model.conventions import (
     OPENCV_FROM_OPENGL,
     file_from_world_from_cam,
-    quat_wxyz_from_rotation,
-    rotation_from_quat_wxyz,
     world_from_cam_of_file,
 )
 from biresnerf.data.model.dataset import Dataset, SourceFormat
+from biresnerf.geometry.rigid import quat_wxyz_from_rotation, rotation_from_quat_wxyz
 from biresnerf.options.formats import Format, formats
 from biresnerf.options.given_poses import PoseReading
 

@@ -9,9 +9,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.model.conventions import quat_wxyz_from_rotation, rotation_from_quat_wxyz
 from biresnerf.geometry.camera.camera_models import Camera
-from biresnerf.geometry.rigid import rigid_inverse
+from biresnerf.geometry.rigid import quat_wxyz_from_rotation, rigid_inverse, rotation_from_quat_wxyz
 
 SensorType = Literal["CAMERA", "IMU"]
 SENSOR_TYPES: tuple[SensorType, ...] = ("CAMERA", "IMU")  # by COLMAP's numbers

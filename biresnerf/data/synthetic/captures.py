@@ -146,7 +146,7 @@ def write_panoramas(folder: Path, n_views: int, width: int, seed: int) -> Path:
     upright = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])  # looking along y
     turns = np.stack([np.zeros(n_views), np.zeros(n_views), rng.uniform(0, 2 * np.pi, n_views)], axis=1)
     tilts = rng.normal(0, _TILT_RAD, (n_views, 3))
-    poses[:, :3, :3] = _rotations(turns) @ upright @ _rotations(tilts)
+    poses[:, :3, :3] = rotation_of(turns) @ upright @ rotation_of(tilts)
     textures = table_textures(seed)
     (folder / "images").mkdir(parents=True, exist_ok=True)
     for index, pose in enumerate(poses):
@@ -195,7 +195,3 @@ def _write_vase(folder: Path, poses: NDArray[np.float64], size: int, seed: int, 
     focal = synthetic_focal(size)
     pictures = (render_shapes(VASE, textures, pose, size, size, focal)[0] for pose in poses)
     return write_blender_set(folder, poses, pictures, "vase", maker)
-
-
-def _rotations(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.stack([rotation_of(vector) for vector in vectors])

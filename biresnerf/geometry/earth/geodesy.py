@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from biresnerf.arrays import Array
+from biresnerf.geometry.rigid import rotation_about
 
 # WGS84 (NIMA TR8350.2): the ellipsoid's semi-major axis, m, and flattening.
 SEMI_MAJOR_AXIS, FLATTENING = 6_378_137.0, 1 / 298.257223563
@@ -51,16 +52,7 @@ def held_so(angles_deg: Array) -> Array:
     """
     yaw, pitch, roll = np.radians(angles_deg).T
     level = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # north, with the right side east
-    return np.asarray(_about(2, -yaw) @ _about(0, pitch) @ level @ _about(2, roll))
-
-
-def _about(axis: int, angle: Array) -> Array:
-    """Rotations [m, 3, 3] about one of the axes, rad."""
-    one, other = (axis + 1) % 3, (axis + 2) % 3
-    turn = np.tile(np.eye(3), (len(angle), 1, 1))
-    turn[:, one, one] = turn[:, other, other] = np.cos(angle)
-    turn[:, one, other], turn[:, other, one] = -np.sin(angle), np.sin(angle)
-    return turn
+    return np.asarray(rotation_about(2, -yaw) @ rotation_about(0, pitch) @ level @ rotation_about(2, roll))
 
 
 def _axes(origin: Array) -> Array:

@@ -7,12 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from biresnerf.data.model.conventions import (
-    file_from_world_from_cam,
-    quat_wxyz_from_rotation,
-    rotation_from_quat_wxyz,
-    world_from_cam_of_file,
-)
+from biresnerf.data.model.conventions import file_from_world_from_cam, world_from_cam_of_file
+from biresnerf.geometry.rigid import quat_wxyz_from_rotation, rotation_from_quat_wxyz
 
 seeds = st.integers(0, 2**32 - 1)
 

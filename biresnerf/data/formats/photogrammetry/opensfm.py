@@ -20,18 +20,24 @@ from pydantic import BaseModel
 
 from biresnerf.data.formats.bad_frames import attempt
 from biresnerf.data.formats.codec import BROWN, FISHEYE, Codec, LensLimits, head_holds
-from biresnerf.data.formats.colmap.model_checks import image_name, rigid_pose
+from biresnerf.data.formats.colmap.model_checks import image_name
 from biresnerf.data.formats.parsed_poses import LensOf, ParsedPoses, panorama_lens
-from biresnerf.data.formats.pose_rows import Placed, Row, at_size_of, folder_with_photos, lens_of, parsed_rows
+from biresnerf.data.formats.pose_rows import (
+    Placed,
+    Row,
+    at_size_of,
+    folder_with_photos,
+    lens_of,
+    parsed_rows,
+    pose_by,
+)
 from biresnerf.data.model.atomic_file import write_json
-from biresnerf.data.model.colmap_scene import matrix_of_pose
-from biresnerf.data.model.conventions import quat_wxyz_from_rotation
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.model.untrusted_file import checked, invalid_file, read_json
 from biresnerf.data.photos.photo_folders import IMAGE_FOLDER
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera, FullParameters
-from biresnerf.geometry.rigid import rigid_inverse
+from biresnerf.geometry.rigid import rotation_of, rotation_vectors
 from biresnerf.options.formats import Format
 
 OPENSFM = Format(
@@ -142,8 +148,7 @@ def world_from_cam_of_vector(rotation: _Vector, translation: _Vector, where: str
             where=where,
             hint="Give the axis times the angle in radians, as OpenSfM does: multiply degrees by pi / 180.",
         )
-    quat_wxyz = (math.cos(half), *(vector * (0.5 * float(np.sinc(half / math.pi)))).tolist())
-    return rigid_inverse(matrix_of_pose(rigid_pose((*quat_wxyz, *translation), where, _HINT)))
+    return pose_by(OPENSFM, np.column_stack([rotation_of(vector), translation]), where)
 
 
 def read_lens(value: Any, where: str) -> Camera | LensOf:
@@ -189,7 +194,7 @@ def write_opensfm(refined: RefinedSet, path: Path) -> None:
     shots = {}
     for image, pose in zip(refined.images, refined.cam_from_world, strict=True):
         shots[image.file_name.removeprefix(f"{IMAGE_FOLDER}/")] = {
-            "rotation": rotation_vector(pose[:3, :3]).tolist(),
+            "rotation": rotation_vectors(pose[:3, :3]).tolist(),
             "translation": pose[:3, 3].tolist(),
             "camera": str(image.camera),
             "orientation": 1,
@@ -206,14 +211,6 @@ def write_opensfm(refined: RefinedSet, path: Path) -> None:
             }
         ],
     )
-
-
-def rotation_vector(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The axis times the angle (radians, at most pi) of a rotation [3, 3]."""
-    w, *axis = quat_wxyz_from_rotation(rotation).tolist()
-    sine = math.sqrt(sum(value * value for value in axis))
-    angle = 2.0 * math.atan2(sine, w)
-    return np.array(axis) * (angle / sine if sine > 0.0 else 2.0)
 
 
 def _lens(camera: Camera) -> dict[str, Any]:

@@ -29,6 +29,7 @@ from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.model.untrusted_file import Table, invalid_file, read_table, read_text
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera, FullParameters
+from biresnerf.geometry.rigid import rotation_about
 from biresnerf.options.formats import Format
 
 REALITYCAPTURE = Format(
@@ -73,6 +74,7 @@ def parse_realitycapture(_root: Path, file: Path) -> ParsedPoses:
     needed = _NEEDED if with_lens else _WITHOUT_LENS
     if missing := [name for name in needed if name not in table.columns]:
         raise invalid_file(table.head, f"has no column {missing[0]}.", _HINT)
+    angles = needed[4:7]
 
     def read(row: list[str], where: str) -> Placed:
         told = [
@@ -83,11 +85,13 @@ def parse_realitycapture(_root: Path, file: Path) -> ParsedPoses:
         value = dict.fromkeys(titles, 0.0) | dict(
             zip(told, table.numbers(row, told, where, _HINT), strict=True)
         )
-        if with_lens:
-            rotation = _about(2, -value["heading"]) @ _about(0, value["pitch"]) @ _about(1, value["roll"])
-        else:
-            rotation = _about(1, value["kappa"]) @ _about(0, value["phi"]) @ _about(2, -value["omega"])
-        centre = [value["x"], value["y"], value["alt" if with_lens else "z"]]
+        a, b, c = (math.radians(value[name]) for name in angles)
+        turns = ((2, -a), (0, b), (1, c)) if with_lens else ((1, c), (0, b), (2, -a))
+        first, second, third = (rotation_about(axis, angle) for axis, angle in turns)
+        rotation, centre = (
+            first @ second @ third,
+            [value["x"], value["y"], value["alt" if with_lens else "z"]],
+        )
         pose = pose_by(REALITYCAPTURE, np.column_stack([rotation, centre]), where)
         if not with_lens:
             return pose, None
@@ -98,7 +102,7 @@ def parse_realitycapture(_root: Path, file: Path) -> ParsedPoses:
         return pose, lens_on_film(distortion, where)
 
     rows = [(listed_name(table.cell(row, "name"), where), where, row) for where, row in table.rows]
-    notes = _perhaps_radians(file.name, table, needed[4:7])
+    notes = _perhaps_radians(file.name, table, angles)
     return parsed_rows(REALITYCAPTURE, [file], rows, read, notes=notes)
 
 
@@ -151,16 +155,6 @@ def lens_on_film(lens: FilmLens, where: str) -> LensOf:
         return lens_of(full, where, (width, height))
 
     return at_size_of(at)
-
-
-def _about(axis: int, angle_deg: float) -> NDArray[np.float64]:
-    """The rotation [3, 3] about a coordinate axis, counter-clockwise."""
-    turn = np.eye(3)
-    after, last = (axis + 1) % 3, (axis + 2) % 3
-    sine, cosine = math.sin(math.radians(angle_deg)), math.cos(math.radians(angle_deg))
-    turn[after, after] = turn[last, last] = cosine
-    turn[last, after], turn[after, last] = sine, -sine
-    return turn
 
 
 def write_realitycapture(refined: RefinedSet, path: Path) -> None:

@@ -15,9 +15,9 @@ from biresnerf.data.formats.parsed_poses import ParsedPoses
 from biresnerf.data.formats.pose_rows import Placed, parsed_rows, pose_of_numbers
 from biresnerf.data.formats.simple.camera_file import read_camera_file
 from biresnerf.data.model.atomic_file import write_text
-from biresnerf.data.model.conventions import quat_wxyz_from_rotation
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.model.untrusted_file import Table, invalid_file, read_table, read_text
+from biresnerf.geometry.rigid import quat_wxyz_from_rotation
 from biresnerf.options.formats import Format
 
 POSES_CSV = Format(

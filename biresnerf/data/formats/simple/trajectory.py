@@ -22,12 +22,12 @@ from biresnerf.data.formats.simple.times_of_images import (
 )
 from biresnerf.data.formats.simple.trajectory_lines import IMAGES_OF, Trajectory
 from biresnerf.data.model.atomic_file import write_text
-from biresnerf.data.model.conventions import quat_wxyz_from_rotation
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.image_order import names_of_poses
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.photos.photo_folders import few_names
 from biresnerf.errors import InputError
+from biresnerf.geometry.rigid import quat_wxyz_from_rotation
 from biresnerf.options.formats import Format
 
 TRAJECTORY = Format(

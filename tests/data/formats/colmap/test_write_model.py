@@ -17,11 +17,10 @@ from biresnerf.data.formats.colmap.read_model import read_colmap_model
 from biresnerf.data.formats.colmap.write_binary import write_colmap_binary
 from biresnerf.data.formats.colmap.write_text import write_colmap_text
 from biresnerf.data.model.colmap_scene import matrix_of_pose
-from biresnerf.data.model.conventions import rotation_from_quat_wxyz
 from biresnerf.data.model.result_model import model_at_poses
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.pixel_rays import pixels_of_points
-from biresnerf.geometry.rigid import rigid_inverse
+from biresnerf.geometry.rigid import rigid_inverse, rotation_from_quat_wxyz
 from tests.data.formats.random_sets import random_model, random_poses, random_result
 from tests.data.scenes import assert_complete
 
