@@ -14,7 +14,7 @@ from itertools import permutations, product
 import numpy as np
 
 from biresnerf.arrays import Array
-from biresnerf.geometry.rigid import rigid_inverse, rotation_of, rotation_vectors
+from biresnerf.geometry.rigid import motion_of, rigid_inverse, rotation_of, rotation_vectors
 from biresnerf.geometry.similarity import Similarity, align_robust
 
 FRAME, TURN = 7, 3  # unknowns
@@ -120,11 +120,11 @@ def tie(fitted: Array, given: Array) -> Tie:
         return found[0]
     some = np.unique(np.linspace(0, len(given) - 1, MOST_TRIED).astype(int))
     tried = _Pair(poses.fitted[some], poses.given[some])
-    likeliest = np.argsort([tried.likelihood(_motion(turn)) for turn in AXES])[::-1][:STARTS]
+    likeliest = np.argsort([tried.likelihood(motion_of(turn)) for turn in AXES])[::-1][:STARTS]
     for k in likeliest:
-        found += poses.ties(_motion(AXES[k]), turns=True)
+        found += poses.ties(motion_of(AXES[k]), turns=True)
     if likeliest[0] != 0:
-        found += poses.ties(_motion(AXES[likeliest[0]]), price=2 * math.log(len(AXES)))
+        found += poses.ties(motion_of(AXES[likeliest[0]]), price=2 * math.log(len(AXES)))
     best = max(found, key=lambda each: each.likelihood - each.price)
     return best if best.explains_more_than(found[0]) else found[0]
 
@@ -241,7 +241,7 @@ class _Pair:
             if np.abs(system @ step[columns]).max() < SETTLED:
                 break
             step *= min(1.0, FURTHEST / float(np.abs(step).max()))
-            cam_from_body = cam_from_body @ _motion(
+            cam_from_body = cam_from_body @ motion_of(
                 rotation_of(step[FRAME : FRAME + TURN]), spread * axes @ step[FRAME + TURN :] / frame.scale
             )
             bodies = self.fitted @ cam_from_body
@@ -286,10 +286,3 @@ def _likelihood(turned: Array, shifted: Array) -> float:
         variance = np.maximum((weight * squares).mean(1, keepdims=True) / 3, EXACT**2)
     far = np.log1p((squares / variance).sum(0) / FREEDOM).sum()
     return float(-1.5 * squares.shape[1] * np.log(variance).sum() - (FREEDOM + 6) / 2 * far)
-
-
-def _motion(rotation: Array, translation: Array | None = None) -> Array:
-    motion = np.eye(4)
-    motion[:3, :3] = rotation
-    motion[:3, 3] = 0.0 if translation is None else translation
-    return motion

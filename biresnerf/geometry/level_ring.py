@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.geometry.rigid import motion_of
+
 
 def level_ring(azimuth: NDArray[np.float64], elevation: float = 0.0) -> NDArray[np.float64]:
     """Poses world_from_cam [n, 4, 4] at distance one from the origin, which the cameras look at.
@@ -18,10 +20,7 @@ def level_ring(azimuth: NDArray[np.float64], elevation: float = 0.0) -> NDArray[
         [np.cos(elevation) * cosine, np.cos(elevation) * sine, np.full_like(azimuth, np.sin(elevation))], 1
     )
     right = np.stack([-sine, cosine, zero], 1)
-    poses = np.tile(np.eye(4), (len(azimuth), 1, 1))
-    poses[:, :3, :3] = np.stack([right, np.cross(-outward, right), -outward], 2)
-    poses[:, :3, 3] = outward
-    return poses
+    return motion_of(np.stack([right, np.cross(-outward, right), -outward], 2), outward)
 
 
 def order_on_ring(world_from_cam: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -14,7 +14,8 @@ import torch
 from numpy.typing import NDArray
 
 from biresnerf.arrays import Array
-from biresnerf.geometry.lie import hat, so3_exp
+from biresnerf.geometry.lie import hat
+from biresnerf.geometry.rigid import motion_of, rotation_of
 from biresnerf.geometry.similarity import nearest_rotation
 
 SAMPLES = 512  # of three points: with half of them wrong, one in eight is good
@@ -67,9 +68,7 @@ def resect(points: Array, rays: Array, bound: float, seed: int = 0) -> Resection
         inliers = _angles(points, rays, rotation, centre) < bound
     if inliers.sum() < LEAST_POINTS or not np.isfinite(centre).all():
         return None
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, centre
-    return Resection(pose, inliers)
+    return Resection(motion_of(rotation, centre), inliers)
 
 
 def three_point_poses(points: Array, rays: Array) -> tuple[Array, Array]:
@@ -171,7 +170,7 @@ def _refined(points: Array, rays: Array, rotation: Array, centre: Array, bound: 
         except np.linalg.LinAlgError:
             break
         centre = centre + rotation @ step[3:]
-        rotation = rotation @ so3_exp(torch.from_numpy(step[:3])).numpy()
+        rotation = rotation @ rotation_of(step[:3])
         if np.linalg.norm(step[:3]) < 1e-12:
             break
     return rotation, centre

@@ -7,14 +7,18 @@ import numpy as np
 from biresnerf.arrays import Array
 
 
+def motion_of(rotation: Array, translation: Array | float = 0.0) -> Array:
+    """Motions [..., 4, 4] of rotations [..., 3, 3] and translations [..., 3]."""
+    motion = np.zeros((*np.shape(rotation)[:-2], 4, 4))
+    motion[..., :3, :3], motion[..., :3, 3], motion[..., 3, 3] = rotation, translation, 1.0
+    return motion
+
+
 def rigid_inverse(b_from_a: Array) -> Array:
     """The ``a_from_b`` [..., 4, 4] of rigid motions: the transposed rotation, no elimination."""
     given = np.asarray(b_from_a, dtype=np.float64)
-    inverse = np.zeros_like(given)
-    inverse[..., :3, :3] = np.swapaxes(given[..., :3, :3], -1, -2)
-    inverse[..., :3, 3] = -(inverse[..., :3, :3] @ given[..., :3, 3, None])[..., 0]
-    inverse[..., 3, 3] = 1.0
-    return inverse
+    rotation = np.swapaxes(given[..., :3, :3], -1, -2)
+    return motion_of(rotation, -(rotation @ given[..., :3, 3, None])[..., 0])
 
 
 def interpolate_pose(first: Array, second: Array, share: float) -> Array:
@@ -26,11 +30,9 @@ def interpolate_pose(first: Array, second: Array, share: float) -> Array:
         first, second: world_from_cam [4, 4].
         share: 0 gives ``first``, 1 gives ``second``.
     """
-    pose = np.eye(4)
-    pose[:3, 3] = (1 - share) * first[:3, 3] + share * second[:3, 3]
-    turn = rotation_vectors((first[:3, :3].T @ second[:3, :3])[None])[0]
-    pose[:3, :3] = first[:3, :3] @ rotation_of(share * turn)
-    return pose
+    turn = rotation_vectors(first[:3, :3].T @ second[:3, :3])
+    centre = (1 - share) * first[:3, 3] + share * second[:3, 3]
+    return motion_of(first[:3, :3] @ rotation_of(share * turn), centre)
 
 
 def quat_wxyz_from_rotation(rotation: Array) -> Array:

@@ -15,6 +15,7 @@ from biresnerf.data.model.measured_places import ControlPoints, PositionPriors
 from biresnerf.data.points.located_points import MOST_FAR_OFF, LocatedPoints, located
 from biresnerf.geometry.earth.geodesy import place_of
 from biresnerf.geometry.earth.georeference import Georeference, NoGeoreference, fit_positions
+from biresnerf.geometry.rigid import motion_of
 from biresnerf.geometry.similarity import Similarity
 from biresnerf.uncertainty import ControlPoint, ControlReport, GeoReference
 from biresnerf.write.output_folder import GEOREFERENCE
@@ -129,10 +130,9 @@ def _far_off(points: ControlPoints, found: LocatedPoints) -> str:
 
 
 def _matrix(similarity: Similarity) -> tuple[tuple[float, ...], ...]:
-    matrix = np.eye(4)
-    matrix[:3, :3] = similarity.scale * similarity.rotation
-    matrix[:3, 3] = similarity.translation
-    return tuple(map(tuple, matrix.tolist()))
+    return tuple(
+        map(tuple, motion_of(similarity.scale * similarity.rotation, similarity.translation).tolist())
+    )
 
 
 def _cameras(

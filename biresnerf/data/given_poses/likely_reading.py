@@ -11,6 +11,7 @@ from biresnerf.data.given_poses.constant_turn import best_turn
 from biresnerf.data.given_poses.matched_details import MatchedPair, matched_pairs, off_by
 from biresnerf.data.given_poses.readings import format_of, poses_read_as
 from biresnerf.data.model.dataset import Dataset
+from biresnerf.geometry.rigid import motion_of
 from biresnerf.judging.compare import BEHIND, READING, is_better
 from biresnerf.options.formats import Format
 from biresnerf.options.given_poses import PoseQuestion, PoseReading, in_words
@@ -48,9 +49,7 @@ def borne_out(dataset: Dataset, pairs: Sequence[MatchedPair]) -> PoseQuestion | 
     best = max(others.values(), key=lambda found: float(found.mean()))
     if not is_better(best - as_given, READING):
         return None
-    turn = np.eye(4)
-    turn[:3, :3] = best_turn(dict(zip(rows, given, strict=True)), pairs)
-    of_body = agreeing(given @ turn)
+    of_body = agreeing(given @ motion_of(best_turn(dict(zip(rows, given, strict=True)), pairs)))
     if is_better(of_body - best, READING):
         return None  # poses of what carries the camera, as the run will find
     reading = next(one for one, found in others.items() if not is_better(best - found, BEHIND))

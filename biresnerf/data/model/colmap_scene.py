@@ -10,7 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.geometry.camera.camera_models import Camera
-from biresnerf.geometry.rigid import quat_wxyz_from_rotation, rigid_inverse, rotation_from_quat_wxyz
+from biresnerf.geometry.rigid import (
+    motion_of,
+    quat_wxyz_from_rotation,
+    rigid_inverse,
+    rotation_from_quat_wxyz,
+)
 
 SensorType = Literal["CAMERA", "IMU"]
 SENSOR_TYPES: tuple[SensorType, ...] = ("CAMERA", "IMU")  # by COLMAP's numbers
@@ -37,9 +42,7 @@ def rigid_pose_of(b_from_a: NDArray[np.float64]) -> RigidPose:
 
 def matrix_of_pose(pose: RigidPose) -> NDArray[np.float64]:
     """The matrix [4, 4] of a pose as COLMAP writes it."""
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation_from_quat_wxyz(pose.quat_wxyz), pose.translation
-    return matrix
+    return motion_of(rotation_from_quat_wxyz(pose.quat_wxyz), pose.translation)
 
 
 @dataclass(frozen=True, eq=False)

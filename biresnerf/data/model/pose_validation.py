@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.errors import InputError
+from biresnerf.geometry.rigid import motion_of
 
 ROTATION_REFUSED = 1e-2  # a singular value farther than this from 1 is a scaling or a shear, not rounding
 ROTATION_WARNED = 1e-4  # files with 5 to 6 digits stay below it
@@ -78,10 +79,8 @@ def rigid_matrix(value: Any, where: str) -> tuple[NDArray[np.float64], float]:
             where=where,
             hint="Move the scene's origin near the scene.",
         )
-    matrix = np.eye(4)
-    matrix[:3, 3] = rows[:3, 3]
-    matrix[:3, :3], deviation = _nearest_rotation(rows[:3, :3], where)
-    return matrix, deviation
+    rotation, deviation = _nearest_rotation(rows[:3, :3], where)
+    return motion_of(rotation, rows[:3, 3]), deviation
 
 
 def _nearest_rotation(block: NDArray[np.float64], where: str) -> tuple[NDArray[np.float64], float]:

@@ -12,7 +12,7 @@ from biresnerf.data.model.measured_places import PositionPriors
 from biresnerf.geometry.body_offset import MAXWELL_MEDIAN, tie
 from biresnerf.geometry.earth.georeference import MOST_SCATTER, MOST_TURNED_DEG, not_far_off
 from biresnerf.geometry.focus import rms_spread
-from biresnerf.geometry.rigid import interpolate_pose
+from biresnerf.geometry.rigid import interpolate_pose, motion_of
 from biresnerf.report import PoseSource
 
 WIDEST_GAP = 6  # images from one known pose to the next that are still taken for a path
@@ -33,8 +33,7 @@ def fill_measured(
     if priors is None or priors.rotations is None:
         return filled
     told = priors.turned & not_far_off(priors.positions_m)
-    rows, measured = priors.rows[told], np.tile(np.eye(4), (int(told.sum()), 1, 1))
-    measured[:, :3, :3], measured[:, :3, 3] = priors.rotations[told], priors.positions_m[told]
+    rows, measured = priors.rows[told], motion_of(priors.rotations[told], priors.positions_m[told])
     tied, new = known[rows], ~known[rows]
     found = measured
     if known.any():

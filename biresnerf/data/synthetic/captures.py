@@ -26,7 +26,7 @@ from biresnerf.data.synthetic.scene import (
 from biresnerf.data.synthetic.shapes import Shape, Texture
 from biresnerf.geometry.camera.camera_models import PANORAMA
 from biresnerf.geometry.level_ring import level_ring
-from biresnerf.geometry.rigid import rotation_of
+from biresnerf.geometry.rigid import motion_of, rotation_of
 
 # The objects of the scene stand on a table in a room, which fills the photos.
 TABLE_SCENE = (
@@ -76,10 +76,7 @@ def walking_cameras(n_views: int, seed: int) -> NDArray[np.float64]:
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right, axis=1, keepdims=True)
-    poses = np.tile(np.eye(4), (n_views, 1, 1))
-    poses[:, :3, 0], poses[:, :3, 1], poses[:, :3, 2] = right, np.cross(forward, right), forward
-    poses[:, :3, 3] = centres
-    return poses
+    return motion_of(np.stack([right, np.cross(forward, right), forward], 2), centres)
 
 
 def table_textures(seed: int) -> list[Texture]:

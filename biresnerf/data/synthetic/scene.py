@@ -13,6 +13,7 @@ from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.conventions import file_from_world_from_cam
 from biresnerf.data.synthetic.camera_photos import Maker, stored_poses, write_camera_photo
 from biresnerf.data.synthetic.shapes import Shape, Texture
+from biresnerf.geometry.rigid import motion_of
 
 CAMERA_DISTANCE = 4.0  # like the NeRF-synthetic sets, as is the angle of view
 CAMERA_ANGLE_X = 0.6911112
@@ -41,13 +42,8 @@ def synthetic_cameras(n_views: int, seed: int) -> NDArray[np.float64]:
     azimuths = golden * np.arange(n_views) + rng.uniform(0, 2 * np.pi) + rng.normal(0, 0.1, n_views)
     across = np.sqrt(1.0 - heights**2)
     outward = np.stack([across * np.cos(azimuths), across * np.sin(azimuths), heights], axis=1)
-    poses = np.tile(np.eye(4), (n_views, 1, 1))
     right = np.stack([-np.sin(azimuths), np.cos(azimuths), np.zeros(n_views)], axis=1)
-    poses[:, :3, 0] = right
-    poses[:, :3, 1] = np.cross(-outward, right)
-    poses[:, :3, 2] = -outward
-    poses[:, :3, 3] = CAMERA_DISTANCE * outward
-    return poses
+    return motion_of(np.stack([right, np.cross(-outward, right), -outward], 2), CAMERA_DISTANCE * outward)
 
 
 def synthetic_focal(size: int) -> float:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from biresnerf.arrays import Array
 from biresnerf.geometry.pose_error import rotation_between_deg
+from biresnerf.geometry.rigid import motion_of
 from biresnerf.geometry.similarity import Similarity, align_robust
 
 # Positions give a frame if there are so many, and if they scatter about the cameras by less than this share of how far
@@ -68,8 +69,7 @@ def fit_positions(
     used = not_far_off(positions_m)
     if not (positions_m != positions_m[0]).any():
         raise NoGeoreference("all positions are at one place")
-    there = np.tile(np.eye(4), (len(positions_m), 1, 1))
-    there[:, :3, 3] = positions_m
+    there = motion_of(np.tile(np.eye(3), (len(positions_m), 1, 1)), positions_m)
     try:
         metres_from_world = align_robust(world_from_cam[used], there[used])
     except ValueError:
