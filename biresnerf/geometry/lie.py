@@ -1,4 +1,4 @@
-"""Exponential and logarithm of rotations and rigid motions on torch tensors, finite everywhere with gradient.
+"""Exponential of rotations and rigid motions on torch tensors, finite everywhere with gradient, and logarithm.
 
 A rotation vector is axis times angle (rad). Rotation and translation are always two arguments, never packed.
 The exponential takes its coefficients and their derivatives from the Stumpff functions, see `_Stumpff`.
@@ -13,11 +13,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from biresnerf.geometry.rigid import rotation_vectors
+
 # Terms of the Stumpff functions' series: below one radian the first one left out is under 1e-17.
 _SERIES_TERMS = 9
-# Squared tangent of the half angle below which the logarithm takes its series (8 terms: under 1e-16).
-_LOG_SERIES_BELOW = 1e-2
-_LOG_SERIES_TERMS = 8
 
 
 def hat(vector: Tensor) -> Tensor:
@@ -72,50 +71,13 @@ def moved_poses(rotvec: Tensor, velocity: Tensor, pose: Tensor) -> Tensor:
 
 
 def so3_log(rotation: Tensor) -> Tensor:
-    """Rotation vectors [..., 3] of angle at most pi, of rotation matrices [..., 3, 3].
-
-    Goes through the unit quaternion, read from the row of the matrix ``4 q q^T`` that is largest for the
-    rotation at hand: linear in the matrix, no square root of a difference, and so exact near pi as well as
-    near zero.
+    """Rotation vectors [..., 3] of rotation matrices [..., 3, 3], without gradient: see `rotation_vectors`.
 
     Raises:
         ValueError: if the last axes are not 3 x 3 or the tensor is not of a float type.
     """
     _require(rotation, (3, 3), "rotation")
-    real, vector = _unit_quaternion(rotation)
-    norm_squared = (vector * vector).sum(-1, keepdim=True)
-    small = norm_squared < _LOG_SERIES_BELOW * real * real
-
-    # Small: 2 atan(n / w) / n as a series in (n / w)^2.
-    real_small = torch.where(small, real, torch.ones_like(real))
-    ratio = torch.where(small, norm_squared, torch.zeros_like(norm_squared)) / (real_small * real_small)
-    series = _horner(ratio, [(-1.0) ** k / (2 * k + 1) for k in range(_LOG_SERIES_TERMS)]) * 2.0 / real_small
-    # Large: the closed form; a real part of zero (angle pi) is an ordinary point of it.
-    norm = torch.where(small, torch.ones_like(norm_squared), norm_squared).sqrt()
-    closed = 2.0 * torch.atan2(norm, real) / norm
-    return torch.where(small, series, closed) * vector
-
-
-def _unit_quaternion(rotation: Tensor) -> tuple[Tensor, Tensor]:
-    """Real part [..., 1] (never negative) and vector part [..., 3] of the unit quaternion of a rotation."""
-    r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation.flatten(-2).unbind(-1)
-    wx, wy, wz = r21 - r12, r02 - r20, r10 - r01
-    xy, xz, yz = r10 + r01, r02 + r20, r21 + r12
-    one = torch.ones_like(r00)
-    rows = [
-        [one + r00 + r11 + r22, wx, wy, wz],
-        [wx, one + r00 - r11 - r22, xy, xz],
-        [wy, xy, one - r00 + r11 - r22, yz],
-        [wz, xz, yz, one - r00 - r11 + r22],
-    ]
-    outer = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
-    largest = outer.diagonal(dim1=-2, dim2=-1).argmax(-1)
-    index = largest[..., None, None].expand(*largest.shape, 1, 4)
-    quat_wxyz = outer.gather(-2, index).squeeze(-2)
-    # The chosen row is 4 q_k q with |q_k| >= 1/2: its norm is at least 2 for a rotation.
-    quat_wxyz = quat_wxyz / quat_wxyz.norm(dim=-1, keepdim=True)
-    quat_wxyz = torch.where(quat_wxyz[..., :1] < 0, -quat_wxyz, quat_wxyz)
-    return quat_wxyz[..., :1], quat_wxyz[..., 1:]
+    return torch.from_numpy(rotation_vectors(rotation.detach().cpu().numpy())).to(rotation)
 
 
 def _exp_coefficients(rotvec: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -185,13 +147,6 @@ def _stumpff_slopes(dtype: torch.dtype, device: torch.device) -> Tensor:
     for k in (1, 2, 3):
         slopes[k + 1, k - 1], slopes[k, k - 1] = k / 2, -1 / 2
     return slopes.to(device)
-
-
-def _horner(x: Tensor, coefficients: list[float]) -> Tensor:
-    value = torch.full_like(x, coefficients[-1])
-    for coefficient in reversed(coefficients[:-1]):
-        value = value * x + coefficient
-    return value
 
 
 def _identity_like(matrix: Tensor) -> Tensor:
