@@ -19,6 +19,8 @@ from biresnerf.errors import InputError
 
 Model = TypeVar("Model", bound=BaseModel)
 
+# A table's head is one of so many lines, as other things may stand above, and names no more columns.
+HEAD_LINES, MOST_COLUMNS = 100, 1000
 MAX_TEXT_BYTES = 64 * 2**20  # some 100 000 frames; a larger file is no pose file
 
 
@@ -104,16 +106,16 @@ def read_table(
     titles: Mapping[str, Sequence[str]],
     is_head: Callable[[Collection[str]], bool],
 ) -> Table | None:
-    """The table below the first line that is a head, between commas, semicolons or tabs; None where none is.
+    """The table below the first of `HEAD_LINES` that is a head, between commas, semicolons or tabs; None where none is.
 
     Args:
         file: its name, for messages.
         titles: what columns of a meaning are called, as patterns of small letters and digits, preferred ones first.
         is_head: whether a line is the head, by the meanings that it has columns for.
     """
-    for index, line in enumerate(lines):
+    for index, line in enumerate(lines[:HEAD_LINES]):
         separator = max(",;\t", key=line.count)
-        words = [re.sub(r"[^a-z0-9]", "", word.lower()) for word in line.split(separator)]
+        words = [re.sub(r"[^a-z0-9]", "", word.lower()) for word in line.split(separator)[:MOST_COLUMNS]]
         columns = {
             meaning: at
             for meaning, patterns in titles.items()
