@@ -9,6 +9,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from biresnerf.geometry.lie import so3_exp
+from biresnerf.geometry.rigid import motion_of
+
 
 @dataclass(frozen=True, eq=False)
 class Ring:
@@ -44,8 +47,10 @@ class Ring:
         outward = torch.stack([across * cosine, across * sine, high], 1)
         right = torch.stack([-sine, cosine, zero], 1)
         facing = torch.stack([right, torch.linalg.cross(-outward, right), -outward], 2)
+        _, y, z = torch.eye(3, dtype=zero.dtype, device=zero.device)
         turn = self.roll - self.quarters.to(zero) * (torch.pi / 2)
-        return torch.cat([facing @ _about_y(-self.pan) @ _about_z(turn), outward[:, :, None]], 2)
+        panned, turned = so3_exp(-self.pan * y), so3_exp(turn[:, None] * z)
+        return torch.cat([facing @ panned @ turned, outward[:, :, None]], 2)
 
     def detached(self) -> Ring:
         """The same ring on the CPU, without gradient."""
@@ -56,19 +61,5 @@ class Ring:
         """Poses world_from_cam [n, 4, 4], in double precision whatever that of the angles is."""
         there = self.detached()
         parts = (there.azimuth, there.elevation, there.pan, there.roll, there.quarters)
-        top = Ring(*(part.double() for part in parts)).poses()
-        matrices = np.tile(np.eye(4), (len(top), 1, 1))
-        matrices[:, :3] = top.numpy()
-        return matrices
-
-
-def _about_y(angle: Tensor) -> Tensor:
-    """Rotation [3, 3] by an angle []."""
-    c, s, zero, one = torch.cos(angle), torch.sin(angle), torch.zeros_like(angle), torch.ones_like(angle)
-    return torch.stack([c, zero, s, zero, one, zero, -s, zero, c]).reshape(3, 3)
-
-
-def _about_z(angle: Tensor) -> Tensor:
-    """Rotations [n, 3, 3] by angles [n]."""
-    c, s, zero, one = torch.cos(angle), torch.sin(angle), torch.zeros_like(angle), torch.ones_like(angle)
-    return torch.stack([c, -s, zero, s, c, zero, zero, zero, one], 1).reshape(-1, 3, 3)
+        top = Ring(*(part.double() for part in parts)).poses().numpy()
+        return motion_of(top[:, :, :3], top[:, :, 3])
