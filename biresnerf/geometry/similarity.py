@@ -8,6 +8,7 @@ import numpy as np
 
 from biresnerf.arrays import Array
 from biresnerf.geometry.focus import rms_spread
+from biresnerf.geometry.rigid import motion_of, rotation_about
 from biresnerf.report import SimilarityReport
 
 # Centres whose correlation across a line is below this share of that along it leave the turn about the line
@@ -67,11 +68,8 @@ class Similarity:
 
     def apply_to_poses(self, a_from_cam: Array) -> Array:
         """Poses [..., 4, 4] in a to poses in b: centres move as points, rotations stay rotations."""
-        a_from_cam = np.asarray(a_from_cam, dtype=np.float64)
-        b_from_cam = a_from_cam.copy()
-        b_from_cam[..., :3, :3] = self.rotation @ a_from_cam[..., :3, :3]
-        b_from_cam[..., :3, 3] = self.apply(a_from_cam[..., :3, 3])
-        return b_from_cam
+        poses = np.asarray(a_from_cam, dtype=np.float64)
+        return motion_of(self.rotation @ poses[..., :3, :3], self.apply(poses[..., :3, 3]))
 
     def inverse(self) -> Similarity:
         """The ``a_from_b`` of this ``b_from_a``."""
@@ -166,9 +164,8 @@ def align_points(in_a: Array, in_b: Array) -> Similarity:
     Raises:
         ValueError: as `align_by_spread`.
     """
-    rigs = np.tile(np.eye(4), (2, len(in_a), 1, 1))
-    rigs[0, :, :3, 3], rigs[1, :, :3, 3] = in_a, in_b
-    return align_robust(*rigs)
+    upright = np.tile(np.eye(3), (len(in_a), 1, 1))
+    return align_robust(motion_of(upright, in_a), motion_of(upright, in_b))
 
 
 def _align_weighted(
@@ -209,8 +206,7 @@ def _rotation_of(correlation: Array, turn: Array) -> Array:
     right_t[2] *= np.linalg.det(right_t)
     about = left.T @ turn @ right_t.T
     angle = np.arctan2(about[2, 1] - about[1, 2], about[1, 1] + about[2, 2])
-    cos, sin = np.cos(angle), np.sin(angle)
-    rotation: Array = left @ np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]]) @ right_t
+    rotation: Array = left @ rotation_about(0, angle) @ right_t
     return rotation
 
 
