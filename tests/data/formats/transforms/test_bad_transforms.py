@@ -16,6 +16,7 @@ from biresnerf.data.formats.pose_rows import MAX_ROWS, parsed_rows
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.formats.transforms.read_transforms import read_transforms
 from biresnerf.errors import InputError
+from biresnerf.options.formats import formats
 from tests.data.scenes import (
     HEIGHT,
     WIDTH,
@@ -285,9 +286,9 @@ def test_rows_and_models_of_images_that_no_file_is_there_for_are_refused_without
 
 
 def test_more_rows_than_any_set_has_are_refused_before_they_are_read(tmp_path):
-    def read():
+    def read(_value, _where):
         raise AssertionError("a row was read")
 
-    rows = [(str(n), f"row {n}", read) for n in range(MAX_ROWS + 1)]
+    rows = [(str(n), f"row {n}", n) for n in range(MAX_ROWS + 1)]
     with pytest.raises(InputError, match="more than 100000 poses"):
-        parsed_rows("csv", [tmp_path / "poses.csv"], rows)
+        parsed_rows(formats()["csv"], [tmp_path / "poses.csv"], rows, read)
