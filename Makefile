@@ -22,7 +22,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Each process of the tests would compile all modules, and pytest rewrite all assertions, again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup web test test-nightly test-fast test-kernels test-lowest test-pythons coverage lint format demo serve bench field-check docs docs-site notebooks screenshots fuzz promises audit sbom compose-check slurm-check consumers-check release
+.PHONY: help setup web test test-nightly mutants test-fast test-kernels test-lowest test-pythons coverage lint format demo serve bench field-check docs docs-site notebooks screenshots fuzz promises audit sbom compose-check slurm-check consumers-check release
 .DELETE_ON_ERROR:
 
 help:  ## what there is
@@ -38,6 +38,9 @@ test: web  ## all tests but those of test-nightly; PYTEST="-k name" chooses
 
 test-nightly: web  ## what takes long and seldom fails alone: deployment, pages' commands, notebooks, fuzz, storms, studies, benchmarks, GPU kernels in an interpreter
 	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --maxprocesses 4 --dist loadfile --no-loadscope-reorder -m nightly $(PYTEST)
+
+mutants: setup  ## plant some fifty faults, one at a time: each must turn a test red (before a release; a quarter of an hour)
+	$(BIN)/python -m tests.mutants
 
 test-fast: setup  ## within a minute: the tests that need no server and no browser and do not train
 	$(BIN)/python -m pytest -n logical --maxprocesses 4 --dist worksteal -m "not server and not browser and not slow and not nightly" $(PYTEST)

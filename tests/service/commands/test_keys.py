@@ -7,8 +7,10 @@ from pathlib import Path
 
 import httpx
 import pytest
+from click.testing import CliRunner
 
 from biresnerf.client import Client, ServiceError
+from service.commands.keys import keys_command
 from service.http.access import UNIDENTIFIED_BURST
 from tests.service.conftest import (
     BURST,
@@ -52,6 +54,25 @@ def test_a_key_may_what_its_scopes_say_and_no_more(
             else:
                 problem(answer, 403, "scope_required")
                 assert f'scope="{needed}"' in answer.headers["www-authenticate"]
+
+
+def test_a_list_for_people_says_until_when_a_key_is_valid(closed: Running):
+    lasting, short, gone = (
+        operator(closed.data_dir, "keys", "create", name, "--tenant", "listed", *more)
+        for name, more in (("lasting", ()), ("short", ("--expires", "90d")), ("gone", ("--expires", "90d")))
+    )
+    operator(closed.data_dir, "keys", "revoke", gone["id"])
+    said = CliRunner().invoke(
+        keys_command, ["list", "--data-dir", str(closed.data_dir)], env={"BIRESNERF_DATABASE_URL": None}
+    )
+    ends = {line.split()[0]: line.split("  ")[4] for line in said.output.splitlines() if " listed " in line}
+    ended = operator(closed.data_dir, "keys", "list")
+    revoked_at = next(key["revoked_at"] for key in ended if key["id"] == gone["id"])
+    assert ends == {
+        lasting["id"]: "valid",
+        short["id"]: f"until {short['expires_at'][:10]}",
+        gone["id"]: f"revoked {revoked_at[:10]}",
+    }
 
 
 def test_revoked_unknown_and_malformed_keys_are_refused_alike(

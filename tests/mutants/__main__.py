@@ -1,0 +1,128 @@
+"""Plant the faults of faults.json one at a time, and see their tests fail.
+
+    python -m tests.mutants                      # all; exit status 1 if one survives, or its line is gone
+    python -m tests.mutants --draw 20 --seed 3   # plant new ones; those that a test finds join faults.json
+
+Each fault changes one line of a copy of the tracked files. Its test runs there twice: with the line as it was, when it
+must pass, and with the fault, when it must fail or never end.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Literal
+
+from pydantic import TypeAdapter
+
+from biresnerf.frozen_model import FrozenModel
+from tests.mutants.draw import drawn_faults
+
+ROOT = Path(__file__).parents[2]
+KEPT = Path(__file__).with_name("faults.json")
+LONGEST_S = 300
+Outcome = Literal["found", "survived", "gone", "red before"]
+
+
+class PlantedFault(FrozenModel):
+    """A line of a file that is replaced by another one, and the test that must see it."""
+
+    file: str
+    old: str
+    new: str
+    test: str
+
+
+FAULTS = TypeAdapter(tuple[PlantedFault, ...])
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--draw", type=int, default=0, help="How many new ones.")
+    parser.add_argument("--seed", type=int, default=0, help="Of the new ones.")
+    asked = parser.parse_args()
+    kept = FAULTS.validate_json(KEPT.read_bytes()) if KEPT.exists() else ()
+    with tempfile.TemporaryDirectory(prefix="biresnerf-mutants-") as folder:
+        copy = Path(folder)
+        _copy_tracked(copy)
+        if not asked.draw:
+            outcomes = [outcome for _, outcome in _planted(kept, copy)]
+            print(dict(Counter(outcomes)))
+            return int(set(outcomes) != {"found"})
+        known = {(fault.file, fault.old) for fault in kept}
+        fresh = [
+            PlantedFault(**fault)
+            for fault in drawn_faults(ROOT, random.Random(asked.seed), asked.draw)
+            if (fault["file"], fault["old"]) not in known
+        ]
+        for fault, outcome in _planted(fresh, copy):
+            if outcome == "found":  # written at once: a run that is stopped keeps what it found
+                kept = (*kept, fault)
+                KEPT.write_bytes(FAULTS.dump_json(kept, indent=1) + b"\n")
+    return 0
+
+
+def _copy_tracked(to: Path) -> None:
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True).stdout
+    for name in listed.decode().split("\0"):
+        if name and (ROOT / name).is_file():
+            (to / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, to / name)
+
+
+def _planted(faults: Iterable[PlantedFault], copy: Path) -> Iterable[tuple[PlantedFault, Outcome]]:
+    passed: dict[str, bool] = {}
+    for fault in faults:
+        outcome = _outcome(fault, copy, passed)
+        print(
+            f"{outcome}: {fault.file}: {fault.old.strip()} -> {fault.new.strip()} ({fault.test})", flush=True
+        )
+        yield fault, outcome
+
+
+def _outcome(fault: PlantedFault, copy: Path, passed: dict[str, bool]) -> Outcome:
+    file = copy / fault.file
+    if not file.exists():
+        return "gone"
+    source = file.read_text()
+    if source.split("\n").count(fault.old) != 1:
+        return "gone"
+    if fault.test not in passed:
+        passed[fault.test] = _passes(fault.test, copy)
+    if not passed[fault.test]:
+        return "red before"
+    lines = source.split("\n")
+    lines[lines.index(fault.old)] = fault.new
+    file.write_text("\n".join(lines))
+    try:
+        return "survived" if _passes(fault.test, copy) else "found"
+    finally:
+        file.write_text(source)
+
+
+def _passes(test: str, copy: Path) -> bool:
+    """Whether the test passes in the copy; one that does not end fails."""
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-n", "0", "-p", "no:cacheprovider", test]
+    # Bytecode knows a file by its time in whole seconds and its size: a fault could be overlooked.
+    around = {**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
+    try:
+        run = subprocess.run(
+            command, cwd=copy, env=around, capture_output=True, timeout=LONGEST_S, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return False
+    return run.returncode == 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
