@@ -15,7 +15,7 @@ PAGES = (
 )
 SHELL, PYTHON = "sh", "python"
 # Blocks of these hold no commands: formulas, trees, output of programs; test_typescript.py checks TypeScript.
-OTHER = {"", "json", "yaml", "text", "sql", "ts"}
+OTHER = {"", "json", "yaml", "toml", "text", "sql", "ts"}
 _FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 _STARTS = re.compile(r"^\s*(\$ |biresnerf |curl |docker |make |pip |python |podman )")
 
