@@ -24,8 +24,8 @@ from benchmarks.method.seeding import shrunk, with_focal
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.formats.simple.poses_json import POSES, matrix_of, read_poses_json
 from biresnerf.data.model.dataset import GUESSES, Dataset
-from biresnerf.data.model.part_of_set import without_copies
 from biresnerf.data.model.refined_set import REFINED
+from biresnerf.data.photos.alike.copied_photos import without_copies
 from biresnerf.data.photos.guessed_lens import GUESSED_FOCAL
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.data.seeding.seed_poses import seed_poses
