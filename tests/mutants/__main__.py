@@ -4,7 +4,7 @@
     python -m tests.mutants --draw 20 --seed 3   # plant new ones; those that a test finds join faults.json
 
 Each fault changes one line of a copy of the tracked files. Its test runs there twice: with the line as it was, when it
-must pass, and with the fault, when it must fail or never end.
+must pass, and with the fault, when it must fail or never end. Slow tests, and those that need a server, have no part.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ from tests.mutants.draw import drawn_faults
 
 ROOT = Path(__file__).parents[2]
 KEPT = Path(__file__).with_name("faults.json")
-LONGEST_S = 300
+LONGEST_S = 120
+FAST = "not server and not browser and not slow and not nightly"  # as of `make test-fast`
 Outcome = Literal["found", "survived", "gone", "red before"]
 
 
@@ -112,7 +113,8 @@ def _outcome(fault: PlantedFault, copy: Path, passed: dict[str, bool]) -> Outcom
 
 def _passes(test: str, copy: Path) -> bool:
     """Whether the test passes in the copy; one that does not end fails."""
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-n", "0", "-p", "no:cacheprovider", test]
+    chosen = ["-x", "-n", "0", "-m", FAST, test]
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *chosen]
     # Bytecode knows a file by its time in whole seconds and its size: a fault could be overlooked.
     around = {**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
     try:

@@ -96,7 +96,7 @@ class LensLimits:
         if known is None:
             return f"{camera.model} is a fisheye"
         if any(getattr(full, name) for name in COEFFICIENTS if name not in known):
-            return f"it does not have all coefficients of {camera.model}"
+            return f"it does not have all coefficients of {camera.model}" if known else "it is distorted"
         if full.fx != full.fy and not self.two_focal_lengths:
             return "it has two focal lengths"
         off = max(abs(full.cx - camera.width / 2), abs(full.cy - camera.height / 2))
