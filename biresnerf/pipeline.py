@@ -19,7 +19,7 @@ from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.part_of_set import without_photos
 from biresnerf.data.photos.alike.copied_photos import without_copies
 from biresnerf.data.photos.guessed_lens import with_shared_predictions
-from biresnerf.data.photos.images import load_images
+from biresnerf.data.photos.images import load_by_content, load_images
 from biresnerf.data.photos.panoramas.cut_panoramas import called_panoramas, cut_panoramas
 from biresnerf.data.photos.video.video_frames import VideoReading
 from biresnerf.data.points.tracks import Tracks
@@ -235,7 +235,8 @@ def _seed(dataset: Dataset, setup: _Setup) -> tuple[Scene, RunOrigin]:
             takes_back_offset=not bodies.tied,
         )
         preview.show_candidate(seeding)
-    images = load_images(
+    load = load_by_content if setup.asked.max_image_size is None else load_images
+    images = load(
         seeding.dataset, options.max_image_size, options.background, _photo_counter(len(dataset), setup)
     )
     origin = run_origin(folder.path, dataset, images, recipe)

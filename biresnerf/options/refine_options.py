@@ -87,7 +87,8 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
         OPEN,
         ge=16,
         le=4096,
-        description="Long side (px) of images during optimisation; results are full size.",
+        description="Long side (px) of images during optimisation; results are full size. Left out, images are up to "
+        "four times larger where a thing before a background fills less than half of them.",
     )
     holdout: Annotated[HeldOut | Open, Option("coarse", "Held-out views", level="usual")] = Field(
         OPEN, description="Views excluded from training, to measure quality; auto: a tenth, at most 10."

@@ -29,6 +29,10 @@ _DEVELOPING_BYTES_PER_PX = 32  # RAW and floating-point numbers take as many
 # A set of opaque images shows its scene before plain black or white:
 BLACK_BELOW = 24  # of 255: sensors and JPEG leave some light in black
 WHITE_ABOVE = 250  # of 255: bright walls and skies stay below it or vary
+OPAQUE_ABOVE = 127  # of 255
+RIMS = (0.005, 0.995)  # of the pixels that show something before it: specks lie outside
+# What photos show before a background has this share of the working size, at least, in photos as many times as large.
+CONTENT_SHARE, LARGER_MOST = 0.5, 4.0
 BORDER_SHARE = 0.75  # of an image's border pixels that must show the colour; a pedestal may cover one side
 IMAGE_SHARE = 0.75  # of the images that must agree; others may show the object cut, or another scene
 
@@ -88,6 +92,27 @@ class ImageSet:
     def counts_image(self, index: int) -> NDArray[np.bool_] | None:
         """bool [h, w], a view of which pixels of image ``index`` count, or None where there are no masks."""
         return None if self.counts is None else self._plane(self.counts, index)
+
+    def content(self, index: int) -> NDArray[np.bool_] | None:
+        """bool [h, w], which pixels of image ``index`` count and show the scene; None where it has surroundings."""
+        if self.background is None:
+            return None
+        opacity, counting = self.alpha_image(index), self.counts_image(index)
+        if opacity is not None:
+            shown = opacity > OPAQUE_ABOVE
+        elif self.background.any():
+            shown = self.image(index).min(2) <= WHITE_ABOVE
+        else:
+            shown = self.image(index).max(2) >= BLACK_BELOW
+        return shown if counting is None else shown & counting
+
+    def content_box(self, index: int) -> NDArray[np.float64] | None:
+        """Corners [2, 2] (x, y, px) of what image ``index`` shows before the background; None for nothing."""
+        content = self.content(index)
+        if content is None or not content.any():
+            return None
+        rows, columns = np.nonzero(content)
+        return np.add(np.quantile([columns, rows], RIMS, axis=1), [[0.0], [1.0]])
 
     def _plane(self, values: NDArray[T], index: int) -> NDArray[T]:
         rows = values[self.offsets[index] : self.offsets[index + 1]]
@@ -153,6 +178,28 @@ def load_images(
         pixels, None if opaque else alpha, offsets, widths, heights, cameras, None, counts if masked else None
     )
     return _with_background(images, background, behind)
+
+
+def load_by_content(
+    dataset: Dataset,
+    max_size: int,
+    background: Background,
+    on_photo: Callable[[int], object] = lambda _done: None,
+) -> ImageSet:
+    """As `load_images`, but with larger photos where a thing before a background fills little of them.
+
+    It is `CONTENT_SHARE` of ``max_size`` long then, as far as photos of `LARGER_MOST` times that size, or the files,
+    show it.
+    """
+    images = load_images(dataset, max_size, background, on_photo)
+    boxes = [box for i in range(len(images)) if (box := images.content_box(i)) is not None]
+    if not boxes:
+        return images
+    long_side = float(np.median(np.ptp(boxes, axis=1).max(axis=1)))
+    larger = round(max_size * min(LARGER_MOST, CONTENT_SHARE * max_size / long_side))
+    if larger <= max_size or max(max(c.width, c.height) for c in dataset.cameras) <= max_size:
+        return images
+    return load_images(dataset, larger, background, on_photo)
 
 
 def decoding_threads(dataset: Dataset) -> int:

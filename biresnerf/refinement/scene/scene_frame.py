@@ -1,8 +1,8 @@
 """The unit frame: where the scene lies, how large it is, and what lies around it.
 
 One rule for all rigs: the inner box [-1, 1]^3 is centred on the point the cameras look at and as large as what a
-camera sees at that distance. A scene with a known background colour is assumed to end there; any other
-continues outside, contracted.
+camera sees at that distance. A scene with a known background colour is assumed to end there, and the box is no larger
+than what photos show before it; any other continues outside, contracted.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam
@@ -25,7 +26,7 @@ logger = logging.getLogger(__name__)
 # Below this mean squared sine the axes are too parallel to say where they meet (a spread of about 6 degrees).
 CONVERGING = 0.01
 FORWARD_FACING_DEPTH = 6.0  # in spreads of the camera centres, where nothing better is known
-ALPHA_MARGIN = 1.15  # poses are noisy: the silhouettes' box is widened by this
+CONTENT_MARGIN = 1.15  # the box of what photos show is widened by this
 # Half an angle of view counts as no more than this tangent (56 deg): fisheyes see to their sides.
 WIDEST_SLOPE = 1.5
 FAR_BOXES = 60.0  # unbounded rays end this many inner boxes away (contracted to 1.98 of 2)
@@ -73,20 +74,22 @@ def _half_angle_tangent(images: ImageSet) -> float:
     return float(np.median([tangents[camera] for camera in images.cameras]))
 
 
-def _silhouette_tangent(images: ImageSet) -> float | None:
-    """How far from the optical axis silhouettes reach, as a tangent; None without alpha."""
+def _content_reach(poses: NDArray[np.float64], images: ImageSet, centre: NDArray[np.float64]) -> float | None:
+    """How far from `centre` photos show anything, at its distance; None before surroundings.
+
+    Of poses [n, 4, 4] or several sets of them. Noisy poses see it farther from there, so the box has room for them.
+    """
     reach = []
-    for i in range(len(images.cameras)):
-        alpha = images.alpha_image(i)
-        if alpha is None:
-            return None
-        seen = alpha > 127
-        counts = images.counts_image(i)
-        rows, columns = np.nonzero(seen if counts is None else seen & counts)
-        if len(rows):
-            x, y = np.meshgrid([columns.min(), columns.max()], [rows.min(), rows.max()])
-            corners = np.stack([x, y], -1).reshape(-1, 2) + 0.5
-            reach.append(np.abs(_slopes(images, i, corners)).max())
+    for i in range(len(images)):
+        box = images.content_box(i)
+        if box is None:
+            continue
+        low, high = _slopes(images, i, box)
+        for pose in poses[i :: len(images)]:
+            x, y, depth = pose[:3, :3].T @ (centre - pose[:3, 3])
+            if depth > 0:
+                sides = np.stack([low, high]) * depth - [x, y]
+                reach.append(np.abs(sides).max())
     return float(np.quantile(reach, 0.9)) if reach else None
 
 
@@ -114,11 +117,10 @@ def scene_frame(poses: np.ndarray, images: ImageSet, depth: float | None = None)
         distance = guess if depth is None else depth
         centre = centres.mean(0) + distance * forward
         logger.info("optical axes do not meet: taking the scene %.3g ahead of the cameras", distance)
-    tangent = _half_angle_tangent(images)
-    silhouette = _silhouette_tangent(images)
-    if silhouette is not None:
-        tangent = min(tangent, ALPHA_MARGIN * silhouette)
-    half = distance * tangent
+    half = distance * _half_angle_tangent(images)
+    reach = _content_reach(poses, images, centre)
+    if reach is not None:
+        half = min(half, CONTENT_MARGIN * reach)
     unit_from_world = Similarity(1 / half, np.eye(3), -centre / half)
     return SceneFrame(
         unit_from_world=unit_from_world,

@@ -11,7 +11,7 @@ from PIL import Image
 
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.photos.decode import decode
-from biresnerf.data.photos.images import load_images, uniform_background, working_size
+from biresnerf.data.photos.images import load_by_content, load_images, uniform_background, working_size
 from biresnerf.errors import InputError, Interrupted
 from tests.data.scenes import (
     HEIGHT,
@@ -24,14 +24,21 @@ from tests.data.scenes import (
 )
 
 
-def png_scene(folder, values: list[np.ndarray]):
+def png_scene(folder, values: list[np.ndarray], **top):
     """A scene of the given pictures, stored as PNG."""
-    document = nerfstudio_scene(folder, count=len(values))
+    document = nerfstudio_scene(folder, count=len(values), **top)
     for index, (picture, row) in enumerate(zip(values, document["frames"], strict=True)):
         row["file_path"] = f"images/{index:03}.png"
         Image.fromarray(picture).save(folder / row["file_path"])
         (folder / f"images/{index:03}.jpg").unlink()
     return read_dataset(save(folder, document))
+
+
+def square_scene(folder, pictures: list[np.ndarray]):
+    """A scene of square pictures, whatever their size."""
+    side = len(pictures[0])
+    lens = {"w": side, "h": side, "fl_x": 1.2 * side, "fl_y": 1.2 * side, "cx": side / 2, "cy": side / 2}
+    return png_scene(folder, pictures, **lens)
 
 
 def noise(seed: int, *shape: int) -> np.ndarray:
@@ -254,3 +261,44 @@ def test_each_photo_that_is_decoded_is_counted_and_the_caller_may_end_it(tmp_pat
 
     with pytest.raises(Interrupted, match="enough"):
         load_images(dataset, on_photo=stop)
+
+
+def shown_before(background: int, side: int, top: int, left: int, height: int, width: int) -> np.ndarray:
+    picture = np.full((side, side, 3), background, dtype=np.uint8)
+    picture[top : top + height, left : left + width] = 128
+    return picture
+
+
+@pytest.mark.parametrize("background", [0, 255])
+def test_what_is_shown_before_an_even_background_is_found_but_for_specks(tmp_path, background):
+    pictures = [shown_before(background, 200, 60 + i, 30, 50, 80) for i in range(4)]
+    for picture in pictures:
+        picture[2, 197] = 128
+    images = load_images(square_scene(tmp_path, pictures))
+    for i in range(4):
+        np.testing.assert_allclose(images.content_box(i), [[30, 60 + i], [110, 110 + i]], atol=1.0)
+    surroundings = load_images(square_scene(tmp_path, pictures), background="none")
+    assert surroundings.content_box(0) is None
+
+
+@pytest.mark.parametrize(
+    ("side", "length", "shown"),
+    [
+        (200, 190, 64),
+        (200, 100, 64),  # half of it already
+        (200, 50, 128),
+        (200, 25, 200),  # the file has no more
+        (600, 30, 256),  # four times as large at most
+        (60, 10, 60),
+    ],
+)
+def test_photos_of_a_small_thing_are_as_large_as_shows_it_at_half_the_working_size(
+    tmp_path, side, length, shown
+):
+    pictures = [shown_before(0, side, side // 3, side // 3, length, length // 2) for _ in range(4)]
+    if length > side // 2:
+        pictures = [shown_before(0, side, 5, 5, length, length) for _ in range(4)]
+    dataset = square_scene(tmp_path, pictures)
+    images = load_by_content(dataset, 64, "auto")
+    assert images.widths.tolist() == [pytest.approx(shown, rel=0.03)] * 4
+    assert load_by_content(dataset, 64, "none").widths.tolist() == [min(side, 64)] * 4

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.camera_models import Camera
+from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.similarity import Similarity
 from biresnerf.refinement.scene.scene_depth import matched_depth
 from biresnerf.refinement.scene.scene_frame import scene_frame
@@ -150,3 +152,33 @@ def test_cameras_all_in_one_place_still_give_a_frame(scene):
     frame = scene_frame(replace(dataset, frames=frames).world_from_cam, images)
     assert np.isfinite(frame.distance)
     assert frame.unit_from_world.scale > 0
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.15])
+def test_a_small_thing_before_black_fills_the_box_also_where_poses_are_noisy(noise):
+    """A cube of half a side 0.1, seen from a distance of 2 by cameras with a wide angle of view."""
+    rng = np.random.default_rng(3)
+    n, side, focal = 24, 120, 60.0
+    camera = Camera("SIMPLE_PINHOLE", side, side, (focal, side / 2, side / 2))
+    forward = rng.normal(size=(n, 3))
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    right = np.cross(forward, [0.3, 0.5, 0.7])
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    poses = np.tile(np.eye(4), (n, 1, 1))
+    poses[:, :3, :3] = np.stack([right, np.cross(forward, right), forward], axis=2)
+    poses[:, :3, 3] = -2 * forward
+    corners = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1)])
+    pictures = np.zeros((n, side, side, 3), dtype=np.uint8)
+    for pose, picture in zip(poses, pictures, strict=True):
+        in_cam = (corners - pose[:3, 3]) @ pose[:3, :3]
+        seen = focal * in_cam[:, :2] / in_cam[:, 2:] + side / 2
+        (left, top), (end, bottom) = np.floor(seen.min(0)).astype(int), np.ceil(seen.max(0)).astype(int)
+        picture[top:bottom, left:end] = 200
+    size = np.full(n, side, dtype=np.int32)
+    images = ImageSet(
+        pictures.reshape(-1, 3),
+        *(None, np.arange(n + 1) * side * side, size, size, (camera,) * n, np.zeros(3, dtype=np.float32)),
+    )
+    noisy = perturb_poses(poses, noise, seed=1)
+    reached = np.abs(scene_frame(noisy, images).unit_from_world.apply(corners)).max()
+    assert (0.4 if noise == 0 else 0.2) < reached < 1
