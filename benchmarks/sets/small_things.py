@@ -1,6 +1,6 @@
 """A set whose photos show a thing from farther away: small, before much black.
 
-    python -m benchmarks.method.small_things SET OUT [--thing 64] [--photo 224]
+    python -m benchmarks.sets.small_things SET OUT [--thing 64] [--photo 224]
     biresnerf compare OUT -o RESULT --preset fast --set start=auto
 
 The photos of SET, a transforms file, are shrunk to `--thing` px, and lie in the middle of black ones of `--photo` px.

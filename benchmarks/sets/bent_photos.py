@@ -1,6 +1,6 @@
 """A set's photos as a lens with distortion would have taken them, to find that lens from photos alone.
 
-    python -m benchmarks.method.bent_photos SET OUT [--photos FOLDER]
+    python -m benchmarks.sets.bent_photos SET OUT [--photos FOLDER]
     biresnerf refine OUT/alone -o RESULT && biresnerf evaluate RESULT OUT/truth.json
 
 OUT gets `alone`, the photos; `lens`, the same with the true lens and no poses; and `truth.json`, both. SET is a

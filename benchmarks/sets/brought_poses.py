@@ -1,6 +1,6 @@
 """Sets as people bring them, made from one whose poses are known.
 
-    python -m benchmarks.method.brought_poses SET OUT [--seed 1]
+    python -m benchmarks.sets.brought_poses SET OUT [--seed 1]
     biresnerf refine OUT/predicted -o RESULT && biresnerf evaluate RESULT SET
     biresnerf refine OUT/first -o FIRST && biresnerf refine OUT/all -o ALL --fixed-from FIRST
 
