@@ -39,7 +39,7 @@ test: web  ## all tests but those of test-nightly; PYTEST="-k name" chooses
 test-nightly: web  ## what takes long and seldom fails alone: deployment, pages' commands, notebooks, fuzz, storms, studies, benchmarks, GPU kernels in an interpreter
 	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --maxprocesses 4 --dist loadfile --no-loadscope-reorder -m nightly $(PYTEST)
 
-mutants: setup  ## plant some fifty faults, one at a time: each must turn a test red (before a release; a quarter of an hour)
+mutants: setup  ## plant the faults of tests/mutants, one at a time: each must turn a test red (before a release)
 	$(BIN)/python -m tests.mutants
 
 test-fast: setup  ## within a minute: the tests that need no server and no browser and do not train

@@ -30,7 +30,7 @@ ROOT = Path(__file__).parents[2]
 KEPT = Path(__file__).with_name("faults.json")
 LONGEST_S = 120
 FAST = "not server and not browser and not slow and not nightly"  # as of `make test-fast`
-Outcome = Literal["found", "survived", "gone", "red before"]
+Outcome = Literal["found", "survived", "gone", "no green test"]
 
 
 class PlantedFault(FrozenModel):
@@ -101,7 +101,7 @@ def _outcome(fault: PlantedFault, copy: Path, passed: dict[str, bool]) -> Outcom
     if fault.test not in passed:
         passed[fault.test] = _passes(fault.test, copy)
     if not passed[fault.test]:
-        return "red before"
+        return "no green test"
     lines = source.split("\n")
     lines[lines.index(fault.old)] = fault.new
     file.write_text("\n".join(lines))

@@ -10,7 +10,7 @@ from pathlib import Path
 LARGEST_INDEX = 3  # smaller numbers are indices and axes, mostly, and their faults crash
 PACKAGES = ("biresnerf", "workers", "service")
 _COMPARED: dict[type[ast.cmpop], str] = {
-    ast.Lt: ">", ast.LtE: "<", ast.Gt: "<", ast.GtE: ">", ast.Eq: "!=", ast.NotEq: "==", ast.In: "not in",
+    ast.Lt: ">", ast.LtE: ">", ast.Gt: "<", ast.GtE: "<", ast.Eq: "!=", ast.NotEq: "==", ast.In: "not in",
     ast.NotIn: "in", ast.Is: "is not", ast.IsNot: "is",
 }  # fmt: skip
 _COMPUTED: dict[type[ast.operator], str] = {ast.Add: "-", ast.Sub: "+", ast.Mult: "/", ast.Div: "*"}
