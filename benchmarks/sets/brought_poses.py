@@ -15,7 +15,6 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from biresnerf.data.formats.read_dataset import read_dataset
@@ -23,8 +22,8 @@ from biresnerf.data.formats.transforms.write_transforms import write_transforms
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.part_of_set import without_photos
 from biresnerf.geometry.focus import focus_point
-from biresnerf.geometry.lie import so3_exp
 from biresnerf.geometry.perturb import perturb_poses
+from biresnerf.geometry.rigid import rotation_of
 from biresnerf.studies.scenes import with_poses
 
 TURNED_DEG, MOVED, LONGER, NOISE = 2.0, 0.05, 1.07, 0.05
@@ -78,9 +77,9 @@ def _guessed(world_from_cam: NDArray[np.float64], seed: int) -> NDArray[np.float
     """Poses [n, 4, 4] with a prediction's errors, in units of the distance to the scene."""
     rng = np.random.default_rng(seed)
     distance = focus_point(world_from_cam).mean_distance
-    turns = so3_exp(torch.from_numpy(rng.normal(0, np.radians(TURNED_DEG), (len(world_from_cam), 3))))
+    turns = rotation_of(rng.normal(0, np.radians(TURNED_DEG), (len(world_from_cam), 3)))
     poses = world_from_cam.copy()
-    poses[:, :3, :3] = turns.numpy() @ poses[:, :3, :3]
+    poses[:, :3, :3] = turns @ poses[:, :3, :3]
     poses[:, :3, 3] /= distance
     poses[:, :3, 3] += rng.normal(0, MOVED, (len(poses), 3))
     return poses

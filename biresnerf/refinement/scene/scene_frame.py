@@ -84,12 +84,11 @@ def _content_reach(poses: NDArray[np.float64], images: ImageSet, centre: NDArray
         box = images.content_box(i)
         if box is None:
             continue
-        low, high = _slopes(images, i, box)
+        slopes = _slopes(images, i, box)
         for pose in poses[i :: len(images)]:
             x, y, depth = pose[:3, :3].T @ (centre - pose[:3, 3])
             if depth > 0:
-                sides = np.stack([low, high]) * depth - [x, y]
-                reach.append(np.abs(sides).max())
+                reach.append(np.abs(slopes * depth - [x, y]).max())
     return float(np.quantile(reach, 0.9)) if reach else None
 
 
