@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import hashlib
 import logging
 import uuid
@@ -19,9 +18,10 @@ from service.http.problems import ProblemError, problem_of
 from service.intake.sandboxed_child import Limits, run_confined
 from service.intake.unpack import UnpackRequest
 from service.intake.uploads import capped, staging_folder, write_stream
+from workers.database.claimed_work import lease_renewed
 from workers.process.waiting import retry_while_unavailable
 from workers.records import Upload
-from workers.settings.errors import EngineError, NotFound, Unavailable
+from workers.settings.errors import EngineError, NotFound
 from workers.store.measured_stream import MeasuredStream
 
 logger = logging.getLogger(__name__)
@@ -124,7 +124,7 @@ async def import_upload(service: Service, upload_id: str) -> None:
         return
     failure: JobError | None = None
     try:
-        async with _renewed(service, upload_id, token):
+        async with lease_renewed(partial(uploads.take, upload_id, token), 2 * service.settings.beat_s):
             await _add_to_dataset(service, await uploads.get(upload_id))
     except NotFound:
         return  # deleted meanwhile
@@ -135,23 +135,6 @@ async def import_upload(service: Service, upload_id: str) -> None:
             await uploads.give_back(upload_id, token, failed=isinstance(error, Exception))
             raise
     await retry_while_unavailable(lambda: uploads.conclude(upload_id, token, failure))
-
-
-@contextlib.asynccontextmanager
-async def _renewed(service: Service, upload_id: str, token: uuid.UUID) -> AsyncIterator[None]:
-    """Renews the lease for as long as the context lasts."""
-
-    async def renew() -> None:
-        while True:
-            await asyncio.sleep(service.settings.beat_s / 2)
-            with contextlib.suppress(Unavailable):  # the next time will do
-                await service.stores.uploads.take(upload_id, token)
-
-    renewing = asyncio.create_task(renew())
-    try:
-        yield
-    finally:
-        renewing.cancel()
 
 
 def _client_error(error: FaultError) -> JobError | None:

@@ -7,6 +7,7 @@ import contextlib
 import logging
 import uuid
 from abc import ABC, abstractmethod
+from collections.abc import AsyncIterator, Awaitable, Callable
 from functools import partial
 from typing import Any, ClassVar
 
@@ -76,6 +77,24 @@ class ClaimedWork(ABC):
     @abstractmethod
     async def _work(self, row: dict[str, Any]) -> None:
         """Do what a row asks for, and write down the outcome. Raises nothing."""
+
+
+@contextlib.asynccontextmanager
+async def lease_renewed(renew: Callable[[], Awaitable[bool]], lease_s: float) -> AsyncIterator[None]:
+    """Renew a lease of ``lease_s`` for as long as the context lasts, or until ``renew`` says that it is lost."""
+
+    async def keep() -> None:
+        ours = True
+        while ours:
+            await asyncio.sleep(lease_s / 4)
+            with contextlib.suppress(Unavailable):  # the next time will do
+                ours = await renew()
+
+    keeping = asyncio.create_task(keep())
+    try:
+        yield
+    finally:
+        keeping.cancel()
 
 
 class LeasedWork(ClaimedWork):

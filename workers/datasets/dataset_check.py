@@ -14,12 +14,14 @@ import time
 import uuid
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from psycopg.types.json import Jsonb
 
 from biresnerf.wire.datasets import CheckReport
 from biresnerf.wire.problems import JobError
+from workers.database.claimed_work import lease_renewed
 from workers.database.database import Connection, Database
 from workers.database.losses import LOSSES_MAX, LostTooOften, at_an_end, counted
 from workers.process.disk_space import EXIT_DISK
@@ -28,7 +30,6 @@ from workers.process.turns import Turns
 from workers.process.waiting import retry_while_unavailable
 from workers.records import shown_folder, shown_key
 from workers.run.child import Child, log_tail
-from workers.settings.errors import Unavailable
 from workers.settings.settings import Settings
 from workers.store.files import FileStore
 from workers.store.trash import discard, forget
@@ -121,15 +122,15 @@ class Checker:
                 "SELECT key, path FROM dataset_files WHERE dataset_id = %s", dataset_id
             )
         )
-        renewing = asyncio.create_task(self._renew(take))
         shown = shown_key(dataset_id)
         try:
-            # Until the outcome is recorded: this process may be killed, or the dataset deleted, before that.
-            await retry_while_unavailable(
-                lambda: self._database.run(discard, shown, after_s=self._settings.upload_expiry_s)
-            )
-            files = [(row["key"], row["path"]) for row in rows]
-            outcome = await self._outcome(files, shown, take)
+            async with lease_renewed(partial(self._take, take), 2 * self._settings.beat_s):
+                # Until the outcome is recorded: this process may be killed, or the dataset deleted, before that.
+                await retry_while_unavailable(
+                    lambda: self._database.run(discard, shown, after_s=self._settings.upload_expiry_s)
+                )
+                files = [(row["key"], row["path"]) for row in rows]
+                outcome = await self._outcome(files, shown, take)
         except BaseException:  # a full disk, a shutdown: it was not the files that ended it
             await at_an_end(
                 self._database,
@@ -138,16 +139,7 @@ class Checker:
                 *(dataset_id, take.token),
             )
             raise
-        finally:
-            renewing.cancel()
         await retry_while_unavailable(lambda: self._database.run(_record, take, outcome))
-
-    async def _renew(self, take: Take) -> None:
-        ours = True
-        while ours:
-            await asyncio.sleep(self._settings.beat_s / 2)
-            with contextlib.suppress(Unavailable):  # the next time will do
-                ours = await self._take(take)
 
     async def _outcome(
         self, members: Sequence[tuple[str, str]], shown: str, take: Take
