@@ -1,6 +1,7 @@
 """`make screenshots`: pictures of the web page for the docs, of a real service that refines a made scene, in Chromium.
 
 Takes some minutes. Writes the files of `SCREENSHOTS`, and keeps the job's result as the finished example of the page.
+Fails where a picture shows a prediction that its own run missed by more than `MOST_MISSED`.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import io
 import shutil
 import tempfile
+from datetime import UTC, datetime
 from pathlib import Path
 
 from PIL import Image
@@ -30,6 +32,7 @@ PERCENT = "Number(document.querySelector('[role=progressbar]')?.getAttribute('ar
 RUNNING_PERCENT = 50  # of the run, where its picture is taken
 WIDTH, HEIGHT, QUALITY = 1200, 900, 82
 SHOWN_HEIGHTS = {"list": 560}  # px; below is nothing
+MOST_MISSED = 3.0  # times
 PATIENCE_MS, SETTLING_MS = 1_800_000, 5_000
 # WebGL without a GPU.
 ARGUMENTS = ("--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader")
@@ -52,8 +55,10 @@ def main() -> None:
         _show_check(page)
         first, dataset = _job_of(page, url)
         _show_running(page)
-        _show_result(page)
         with Client(url) as client:
+            left, at = client.job(first).progress.eta_s, datetime.now(UTC)
+            _show_result(page)
+            _check_predictions(client, first, left, at)
             client.download_all(first, Path(temporary, "result"))
             keep_example(Path(temporary, "result"), EXAMPLE)
             second = client.create_job(dataset, OTHER, labels={"name": f"{NAME}, {OTHER['steps']} steps"})
@@ -91,6 +96,24 @@ def _show_running(page: Page) -> None:
     page.wait_for_function(f"() => {PERCENT} > {RUNNING_PERCENT}")
     _wait_for_drawing(page)
     _take(page, "running")
+
+
+def _check_predictions(client: Client, job_id: str, left: float | None, at: datetime) -> None:
+    """Hold the seconds that the check showed, and those ``left`` when the job ran, against what the job took."""
+    job = client.job(job_id)
+    report = client.dataset(job.dataset_id).report
+    if report is None or job.started_at is None or job.finished_at is None or left is None:
+        raise SystemExit("A picture shows a job without a prediction.")
+    whole = report.expected_s[report.preset]
+    for picture, (low, high), took in (
+        ("check", whole, (job.finished_at - job.started_at).total_seconds()),
+        ("running", (left, left), (job.finished_at - at).total_seconds()),
+    ):
+        print(f"page_{picture}: predicted {low:.0f} to {high:.0f} s, took {took:.0f} s")
+        if not low / MOST_MISSED <= took <= high * MOST_MISSED:
+            raise SystemExit(
+                f"page_{picture} shows a prediction that its run missed by more than {MOST_MISSED:g} times."
+            )
 
 
 def _show_result(page: Page) -> None:
