@@ -11,10 +11,12 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import anyio
+import httpx
 import pytest
 
-from biresnerf.client import AsyncClient
+from biresnerf.client import AsyncClient, ServiceError
 from biresnerf.wire.results import ArtifactView
+from tests.client.fake_service import client_of
 
 CONTENT = os.urandom(300_000)
 SENT = 100_000
@@ -92,4 +94,13 @@ def test_a_download_that_is_cancelled_before_its_first_byte_leaves_nothing(
             assert scope.cancelled_caught
 
     anyio.run(cancelled_while_it_looks_what_is_there)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_of_the_right_length_that_arrives_with_other_content_is_not_kept(tmp_path: Path) -> None:
+    other = httpx.ByteStream(CONTENT[:-1] + bytes([CONTENT[-1] ^ 1]))
+    client = client_of(lambda _: httpx.Response(200, stream=other))
+    with pytest.raises(ServiceError) as damaged:
+        anyio.run(client.download, FILE, tmp_path / "a")
+    assert damaged.value.code == "download_damaged"
     assert list(tmp_path.iterdir()) == []

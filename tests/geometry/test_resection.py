@@ -44,6 +44,18 @@ def test_one_of_at_most_four_solutions_of_three_points_is_the_camera(seed):
     assert max(nearest) < 0.05  # degrees and lengths: near a double root, digits are lost
 
 
+def test_solutions_of_three_points_have_them_in_front_also_where_rays_are_wide_apart():
+    rng = np.random.default_rng(0)
+    rays = rng.normal(size=(100, 3, 3)) * [1, 1, 0.5]
+    rays[..., 2] = np.abs(rays[..., 2])
+    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+    for triple in rays:
+        points = rng.uniform(1, 4, (3, 1)) * triple
+        rotations, centres = three_point_poses(points[None], triple[None])
+        assert (((points - centres[:, None]) @ rotations * triple).sum(2) > 0).all()
+        assert np.linalg.norm(centres, axis=1).min() < 1e-3  # the camera that saw them
+
+
 @pytest.mark.parametrize("flat", [False, True])
 def test_half_of_the_points_wrong_leave_the_camera_where_it_is(flat):
     rng = np.random.default_rng(1)

@@ -129,6 +129,17 @@ def test_outliers_drag_the_least_squares_alignment_but_not_the_robust_one(share)
     assert good_cameras(align_by_spread) > 1.0
 
 
+def test_a_scale_that_is_known_stays_1_though_the_rigs_sizes_differ():
+    rng = np.random.default_rng(12)
+    rig = dome(20, rng)
+    turn, shift = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
+    estimate = similar(jitter(rig, rng, 0.001, 0.004), 1.3, turn, shift)
+    found = align_robust(estimate, rig, with_rotations=True, with_scale=False)
+    assert found.scale == 1.0
+    assert angle_deg(found.rotation, turn.T) < 0.15
+    assert align_robust(estimate, rig).scale == pytest.approx(1 / 1.3, rel=0.01)
+
+
 @pytest.mark.parametrize("align", [align_by_spread, align_robust])
 def test_rigs_that_cannot_be_compared_are_refused(align):
     rig = dome(4, np.random.default_rng(0))

@@ -10,21 +10,17 @@ import pytest
 from PIL import Image
 
 from biresnerf.data.model.dataset import Dataset, Frame, SourceFormat
-from biresnerf.data.model.image_order import pose_distances
 from biresnerf.data.seeding import cached_mapping as remembered_mapping
 from biresnerf.data.seeding import map_images
 from biresnerf.data.seeding.initial_poses import InitialPoses
-from biresnerf.data.seeding.map_images import MappedModel
-from biresnerf.data.seeding.match_poses import STRAY_SHARE, carry_model
 from biresnerf.data.seeding.seed_poses import Seeding, seed_poses
 from biresnerf.data.synthetic.camera_photos import MAKERS
 from biresnerf.data.synthetic.scene import synthetic_focal
 from biresnerf.errors import FAULTS_RAISE, Interrupted, RefinementError
 from biresnerf.geometry.camera.camera_models import Camera
-from biresnerf.geometry.focus import focus_point
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import rotation_angle_deg, rotation_between_deg
-from biresnerf.geometry.similarity import Similarity, align_by_spread
+from biresnerf.geometry.similarity import align_by_spread
 from tests.data.photos.geotagged import geotag
 from tests.data.scenes import plain_features, textured_arc
 
@@ -134,57 +130,6 @@ def test_what_matches_cannot_place_is_guessed_and_said(completed, truth):
     assert any("04.jpg (neighbours)" in text for text in completed.dataset.warnings)
 
 
-def model(truth: Dataset, *, turned: tuple[int, ...] = ()) -> MappedModel:
-    """The true rig, in a frame of its own, with some cameras turned about."""
-    poses = truth.world_from_cam
-    for i in turned:
-        poses[i, :3, :3] = poses[i, :3, :3] @ np.diag([-1.0, 1, -1])
-    moved = Similarity(0.2, np.diag([1.0, -1, -1]), np.array([3.0, 4, 5])).apply_to_poses(poses)
-    return MappedModel("global", np.arange(VIEWS), moved, {}, 100, 300, 0.5)
-
-
-def test_a_camera_that_strays_alone_is_not_believed(noisy, truth):
-    carried = carry_model(model(truth, turned=(3,)), noisy.world_from_cam, noisy.posed)
-    assert carried is not None
-    assert np.flatnonzero(~carried.placed).tolist() == [3]
-    np.testing.assert_array_equal(carried.world_from_cam[3], noisy.world_from_cam[3])
-
-
-def test_a_camera_whose_given_position_alone_is_far_off_is_believed_within_reason(noisy, truth):
-    off = np.linalg.norm(noisy.world_from_cam[:, :3, 3] - truth.world_from_cam[:, :3, 3], axis=1)
-    for medians, believed in ((5.0, True), (20.0, False)):
-        given = noisy.world_from_cam
-        given[3, :3, 3] = truth.world_from_cam[3, :3, 3] + [0, medians * np.median(off), 0]
-        carried = carry_model(model(truth), given, noisy.posed)
-        assert carried is not None
-        assert np.flatnonzero(~carried.placed).tolist() == ([] if believed else [3])
-
-
-@pytest.mark.parametrize("unit", [0.001, 1.0, 1000.0])
-def test_which_cameras_stray_does_not_depend_on_the_unit_of_the_given_poses(truth, unit):
-    given = truth.world_from_cam
-    distance = focus_point(given).mean_distance
-    given[3, 1, 3] += 0.6 * STRAY_SHARE * distance
-    given[6, 1, 3] += 3 * STRAY_SHARE * distance
-    in_unit = Similarity(unit, np.eye(3), np.zeros(3)).apply_to_poses(given)
-    carried = carry_model(model(truth), in_unit, truth.posed)
-    assert carried is not None
-    assert np.flatnonzero(~carried.placed).tolist() == [6]
-
-
-def test_a_model_with_many_strays_is_not_offered(noisy, truth):
-    assert carry_model(model(truth, turned=(1, 4, 8)), noisy.world_from_cam, noisy.posed) is None
-
-
-def test_two_given_poses_tie_a_model_to_their_frame(truth):
-    posed = np.zeros(VIEWS, dtype=bool)
-    posed[[2, 6]] = True
-    carried = carry_model(model(truth), truth.world_from_cam, posed)
-    assert carried is not None
-    np.testing.assert_allclose(carried.world_from_cam, truth.world_from_cam, atol=1e-6)
-    assert carry_model(model(truth), truth.world_from_cam, np.zeros(VIEWS, dtype=bool)) is None
-
-
 def test_pictures_without_texture_give_no_poses(noisy, tmp_path):
     frames = []
     for i, frame in enumerate(noisy.frames):
@@ -193,18 +138,6 @@ def test_pictures_without_texture_give_no_poses(noisy, tmp_path):
         frames.append(replace(frame, path=path, name=path.name))
     (candidate,) = seed_poses(replace(noisy, root=tmp_path, frames=tuple(frames))).candidates
     assert set(candidate.sources) == {"given"}
-
-
-def test_many_images_are_matched_with_those_that_see_nearly_the_same():
-    turn = np.linspace(0, 2 * np.pi, 8, endpoint=False)
-    poses = np.tile(np.eye(4), (8, 1, 1))
-    for pose, angle in zip(poses, turn, strict=True):
-        forward = -np.array([np.cos(angle), 0, np.sin(angle)])
-        down = np.array([0.0, 1, 0])
-        pose[:3, :3] = np.stack([np.cross(down, forward), down, forward], 1)
-        pose[:3, 3] = -4 * forward
-    ring = {tuple(sorted((i, (i + 1) % 8))) for i in range(8)}
-    assert map_images.nearest_pairs(pose_distances(poses), 2) == ring
 
 
 def test_matching_stops_when_asked(noisy):

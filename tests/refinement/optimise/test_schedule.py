@@ -9,8 +9,6 @@ from biresnerf.options.presets import PRESETS
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.refinement.optimise.schedule import FREEZE_SHARE, LENS_START, Schedule, smooth_ramp
 
-pytestmark = pytest.mark.slow
-
 SMALL_JUMP = 0.15  # of the largest value; the shortest ramp takes 15 steps
 
 
@@ -67,6 +65,7 @@ def test_everything_within_stage_1_changes_little_from_step_to_step(schedule):
         assert largest_jump(values) < SMALL_JUMP
 
 
+@pytest.mark.slow
 def test_everything_within_stage_2_changes_little_from_step_to_step_until_poses_freeze(schedule):
     switch = switch_of(schedule)
     steps = range(switch, int(FREEZE_SHARE * schedule.steps) - 1)
