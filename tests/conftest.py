@@ -22,7 +22,7 @@ os.environ[FAULTS_RAISE] = "1"  # no test must pass on the evidence that is left
 
 # A test that uses one of these fixtures, directly or not, needs what the marker says.
 MARKERS_OF_FIXTURES = {
-    "server": {"service", "closed", "server", "slots"},
+    "server": {"service", "closed", "server", "slots", "moto"},
     "browser": {"browser"},
 }
 # `make test-nightly` runs what lies here, so that `make test` stays short enough to be run before each commit.

@@ -10,19 +10,14 @@ import pytest
 
 from biresnerf.data import workload
 from biresnerf.data.model.dataset import Dataset
-from biresnerf.data.photos.images import ImageSet, load_images
+from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.judging.compare import Rule
 from biresnerf.refinement.optimise.methods import Recipe
-from biresnerf.refinement.verdict.image_flags import blurred, exposure_off, moved_far, sharpness
 from biresnerf.refinement.verdict.judgement import Judgement, judge_poses
-from biresnerf.refinement.verdict.pose_evidence import compare_on_matches, working_share
 from biresnerf.refinement.views import compare_rigs, pose_trials
-from biresnerf.refinement.views.compare_rigs import Rig
-from biresnerf.refinement.views.held_out_views import held_out_views, unseen_rounds, unseen_views
-from biresnerf.refinement.views.motion import moved_px
-from biresnerf.report import EpipolarEvidence
+from biresnerf.refinement.views.held_out_views import unseen_rounds
 from biresnerf.studies.scenes import with_poses
 from tests.refinement.tiny_scene import (
     CPU,
@@ -169,13 +164,6 @@ def test_poses_that_stayed_are_unchanged(scene):
     assert (verdict.verdict, verdict.returned) == ("unchanged", "input")
 
 
-def test_the_working_share_is_of_the_long_sides(scene):
-    dataset = scene[0]
-    rig = Rig(dataset.world_from_cam, tuple(dataset.camera_of(i) for i in range(VIEWS)))
-    assert working_share(rig, scene[1]) == 1
-    assert working_share(rig, load_images(dataset, 12)) == 0.5
-
-
 def test_matches_alone_tell_good_poses_from_bad_ones(scene, noisy, monkeypatch):
     monkeypatch.setattr(f"{judge_poses.__module__}.compare_placed", lambda *_, **__: None)
     truth, matches = scene[0].world_from_cam, true_matches(scene[0])
@@ -225,66 +213,6 @@ def test_images_whose_poses_were_guessed_have_no_part_in_the_trials(scene, noisy
     np.testing.assert_allclose(other.trial_psnr[0], found.trial_psnr[0], atol=0.05)
 
 
-def test_motion_in_the_image_is_that_of_a_turned_camera(scene):
-    dataset, images = scene
-    cameras = tuple(dataset.camera_of(i) for i in range(VIEWS))
-    turned = dataset.world_from_cam.copy()
-    angle = 0.02
-    about_y = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-    turned[:, :3, :3] = turned[:, :3, :3] @ about_y
-    moved = moved_px(Rig(dataset.world_from_cam, cameras), Rig(turned, cameras), images)
-    assert moved == pytest.approx(angle * images.cameras[0].full().fx, rel=0.1)
-
-
-def test_unseen_views_hold_those_never_trained_on_and_spare_enough():
-    for count in range(4, 120):
-        held_out = [1] if count > 5 else []
-        views = unseen_views(count, held_out, 16)
-        assert set(held_out) <= set(views) < set(range(count))
-        assert len(views) == len(set(views)) <= max(1, min(16, count // 3))
-    assert len(unseen_views(100, list(range(0, 100, 10)), 16)) == 16
-    assert unseen_views(30, list(range(12)), 16) == list(range(12))
-
-
-@pytest.mark.parametrize("count", range(1, 40))
-def test_small_sets_are_looked_at_in_rounds_until_enough_views_were_unseen_or_all(count):
-    held_out = held_out_views(count, "auto")
-    rounds = unseen_rounds(count, held_out, 16)
-    assert rounds[0] == unseen_views(count, held_out, 16)
-    seen = [view for views in rounds for view in views]
-    assert len(seen) == len(set(seen)), "no view counts twice"
-    assert all(len(views) <= max(1, count // 3) for views in rounds), "two thirds are left to learn from"
-    if len(rounds[0]) >= 8 or not rounds[0]:
-        assert len(rounds) == 1
-    elif count >= 9:
-        assert len(seen) >= 8
-
-
-def test_a_blurred_photo_tells_on_itself(scene):
-    dataset, images = scene
-    spoilt = images.pixels.copy()
-    rows = slice(int(images.offsets[5]), int(images.offsets[6]))
-    photo = images.image(5).astype(float)
-    for _ in range(3):
-        photo = sum(np.roll(photo, shift, (0, 1)) for shift in ((0, 0), (0, 1), (1, 0), (1, 1))) / 4
-    spoilt[rows] = photo.reshape(-1, 3).astype(np.uint8)
-    poses = dataset.world_from_cam
-    assert not blurred(sharpness(images, poses)).any()
-    assert np.flatnonzero(blurred(sharpness(replace(images, pixels=spoilt), poses))).tolist() == [5]
-
-
-def test_outliers_in_exposure_and_motion_are_flagged_and_they_alone():
-    gain = np.exp(np.random.default_rng(1).normal(0, 0.02, 20))
-    assert not exposure_off(gain).any()
-    gain[[4, 9]] = 0.7, np.nan
-    assert np.flatnonzero(exposure_off(gain)).tolist() == [4]
-    assert not exposure_off(np.full(5, np.nan)).any()
-    turned, shifted = np.full(20, 0.5), np.full(20, 0.01)
-    assert not moved_far(turned, shifted, 4.0).any()
-    turned[3], shifted[8] = 6.0, 0.5
-    assert np.flatnonzero(moved_far(turned, shifted, 4.0)).tolist() == [3, 8]
-
-
 def test_trainings_are_the_same_again(scene):
     dataset, images = scene
     trials = pose_trials.PoseTrials(
@@ -294,28 +222,6 @@ def test_trainings_are_the_same_again(scene):
     for trial in (first, again):
         trial.train(1.0)
     np.testing.assert_array_equal(first.scores().psnr, again.scores().psnr)
-
-
-def test_matches_of_points_left_out_judge_and_photos_placed_by_a_guess_do_not(scene, noisy):
-    dataset, truth = scene[0], scene[0].world_from_cam
-    cameras = tuple(dataset.camera_of(i) for i in range(VIEWS))
-    tracks = true_matches(dataset)
-    guessed = np.arange(VIEWS) < VIEWS // 2
-    worse = np.where(guessed[:, None, None], truth, noisy)
-    before = np.where(guessed[:, None, None], noisy, truth)  # the guesses gain, the placed ones lose
-
-    def found(placed: np.ndarray, tracks: Tracks, *, started: bool) -> EpipolarEvidence:
-        rigs = Rig(before, cameras), Rig(worse, cameras)
-        return compare_on_matches(*rigs, tracks, placed, started_from_matches=started)
-
-    judged_by_all = found(~guessed, tracks, started=True)
-    assert judged_by_all.error_px.finding != "better"
-    assert judged_by_all.error_px.count == VIEWS - VIEWS // 2
-    assert judged_by_all.independent
-    assert judged_by_all.matches == len(tracks.split()[1].pairs()[0])
-    few = tracks.where(tracks.point < 12 * VIEWS)  # too few points to spare any
-    assert not found(~guessed, few, started=True).independent
-    assert found(~guessed, few, started=False).independent
 
 
 def test_a_camera_that_its_own_matches_contradict_is_named(scene, monkeypatch):

@@ -13,42 +13,9 @@ from biresnerf.data.synthetic.scene import synthetic_cameras
 from biresnerf.refinement.optimise.renderer import Renderer
 from biresnerf.refinement.views import evaluation
 from biresnerf.refinement.views.evaluation import fit_held_out_poses, orbit_poses, render_view, score_views
-from biresnerf.refinement.views.held_out_views import held_out_views
 from tests.refinement.tiny_scene import tiny_optimiser, tiny_options, tiny_set
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.mark.parametrize("count", [1, 2, 3, 5, 6, 10, 47, 100, 1000])
-@pytest.mark.parametrize("asked", ["auto", 0, 1, 7, 200])
-def test_held_out_views_are_distinct_indices_and_leave_three_to_learn_from(count, asked):
-    views = held_out_views(count, asked)
-    assert views == sorted(set(views))
-    assert all(0 <= view < count for view in views)
-    assert not views or count - len(views) >= 3
-    if asked != "auto":
-        assert len(views) == max(0, min(asked, count - 3))
-
-
-def test_a_tenth_is_held_out_by_default_at_most_ten_and_none_of_a_few():
-    counts = {5: 0, 6: 1, 25: 2, 100: 10, 1000: 10}
-    assert {n: len(held_out_views(n, "auto")) for n in counts} == counts
-
-
-def test_held_out_views_are_spread_evenly():
-    gaps = np.diff([-5, *held_out_views(100, 10), 105])
-    assert gaps.min() >= 9
-    assert gaps.max() <= 11
-
-
-def test_views_whose_own_pose_is_doubtful_are_not_held_out():
-    sound = np.ones(11, dtype=bool)
-    assert held_out_views(11, "auto", sound) == held_out_views(11, "auto") == [5]
-    sound[5] = False
-    (view,) = held_out_views(11, "auto", sound)
-    assert view in (4, 6)
-    assert not {5} & set(held_out_views(11, 8, sound))
-    assert held_out_views(11, "auto", np.zeros(11, dtype=bool)) == [5], "nothing better: any will do"
 
 
 def turned(rig: np.ndarray) -> np.ndarray:

@@ -16,7 +16,6 @@ import pytest
 from biresnerf.options.presets import PRESETS
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from service.app import create_app
-from service.http.hosts import is_host
 from tests.service.conftest import LIMITS, Running, problem, ready_dataset, short_folder, submit
 from tests.service.free_port import free_port
 from workers.database.embedded_postgres import EmbeddedPostgres
@@ -299,22 +298,6 @@ def test_a_server_that_cannot_start_says_why(service: Running, tmp_path: Path) -
     port = service.url.rsplit(":", 1)[1]
     assert "BIRESNERF_PORT" in said(DATABASE_URL="postgresql://x", PORT=port)
     assert "BIRESNERF_PORT" in said(PORT="many")
-
-
-@pytest.mark.parametrize(
-    "host",
-    [
-        "localhost",
-        "127.0.0.1:8000",
-        "[::1]:80",
-        "web_1",
-        "my-machine",
-        "poses.example.org.",
-        "3d.example.org",
-    ],
-)
-def test_a_host_that_names_a_machine_is_one(host: str) -> None:
-    assert is_host(host)
 
 
 def test_two_keys_in_one_request_are_refused(http: httpx.Client) -> None:

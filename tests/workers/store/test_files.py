@@ -18,8 +18,8 @@ from workers.store import file_places
 from workers.store.file_places import Bucket, BucketPlace, LocalPlace
 from workers.store.files import PART_BYTES, FileStore
 
-pytestmark = [pytest.mark.server, pytest.mark.anyio]
-KINDS = ["folder", "moto", "s3rver"]
+pytestmark = pytest.mark.anyio
+BUCKETS = [pytest.param(kind, marks=pytest.mark.server) for kind in ("moto", "s3rver")]
 LARGE = bytes(range(256)) * 80_000  # 20 MB: three parts
 
 
@@ -40,7 +40,7 @@ def s3rver() -> Iterator[str]:
         yield address
 
 
-@pytest.fixture(params=KINDS)
+@pytest.fixture(params=["folder", *BUCKETS])
 def files(request: pytest.FixtureRequest, tmp_path: Path) -> FileStore:
     if request.param == "folder":
         return FileStore(LocalPlace(tmp_path / "store"))
@@ -162,7 +162,7 @@ async def test_a_working_store_is_healthy(files: FileStore):
     assert await files.healthy()
 
 
-@pytest.mark.parametrize("kind", ["moto", "s3rver"])
+@pytest.mark.parametrize("kind", BUCKETS)
 async def test_a_signed_address_serves_ranges_and_takes_one_key_for_its_time(
     request: pytest.FixtureRequest, kind: str
 ):

@@ -10,7 +10,7 @@ import psycopg
 import pytest
 import standardwebhooks
 
-from biresnerf.wire.webhooks import ALL_EVENTS
+from biresnerf.wire.webhooks import ALL_EVENTS, new_secret
 from tests.workers.conftest import Slots
 from tests.workers.webhooks.webhook_receiver import (
     Dispatchers,
@@ -78,6 +78,19 @@ async def test_a_message_that_somebody_caught_is_of_no_use_later_or_as_another(
     old = signed_headers(caught.headers["webhook-id"], now - 6 * 60, caught.body, [secret])
     with pytest.raises(standardwebhooks.WebhookVerificationError, match="too old"):
         reader.verify(caught.body, old)
+
+
+def test_while_a_secret_is_rotated_holders_of_the_old_and_of_the_new_one_believe_a_message_and_nobody_else():
+    old, new, other = (new_secret() for _ in range(3))
+    body, at = b'{"type": "job.succeeded"}', int(time.time())
+    headers = signed_headers("msg_1", at, body, [new, old])
+    for secret in (old, new):
+        assert standardwebhooks.Webhook(secret).verify(body, headers) == {"type": "job.succeeded"}
+        for changed in ({"webhook-id": "msg_2"}, {"webhook-timestamp": str(at - 1)}):
+            with pytest.raises(standardwebhooks.WebhookVerificationError):
+                standardwebhooks.Webhook(secret).verify(body, headers | changed)
+    with pytest.raises(standardwebhooks.WebhookVerificationError):
+        standardwebhooks.Webhook(other).verify(body, headers)
 
 
 async def test_only_what_was_asked_for_comes_and_only_to_its_tenant(
