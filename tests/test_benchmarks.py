@@ -14,6 +14,8 @@ import pytest
 
 from benchmarks.gpu import report
 from benchmarks.method import peers
+from benchmarks.sets import made_aerial
+from benchmarks.sets.aerial_ground import render
 from benchmarks.speed.clock import timed
 from biresnerf.data.model.dataset import Dataset, Frame, SourceFormat
 from biresnerf.data.synthetic.scene import synthetic_focal
@@ -112,3 +114,32 @@ def test_wheels_stand_in_for_what_is_missing(tmp_path):
     with (tmp_path / "said.txt").open("w") as said:
         assert report.run(part, variables, said) == "exit status 0"
     assert (tmp_path / "said.txt").read_text() == "found\n"
+
+
+def test_photos_of_the_made_neighbourhood_show_one_place_where_their_poses_say():
+    yaw, pitch, centres = made_aerial.flight(2, np.random.default_rng(3))
+    poses, focal, width, height = made_aerial.poses_of(yaw, pitch, centres), 150.0, 220, 165
+    (photo, depth), (other, other_depth) = (render(pose, width, height, focal, 1, 1) for pose in poses)
+    x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
+    at = np.stack([x / focal, y / focal, np.ones_like(x), 1 / depth], -1) * depth[..., None]
+    moved = at @ (np.linalg.inv(poses[1]) @ poses[0]).T
+    column = np.floor(moved[..., 0] / moved[..., 2] * focal + width / 2).astype(int)
+    row = np.floor(moved[..., 1] / moved[..., 2] * focal + height / 2).astype(int)
+    both = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    assert both.mean() > 0.5
+    row, column = row[both], column[both]
+    off = np.abs(moved[both][:, 2] - other_depth[row, column])
+    assert np.median(off) < 0.2  # of 62 m, by pixels of 0.4 m; the rest is edges of roofs and trees
+    assert np.mean(off < 0.5) > 0.9
+    assert np.corrcoef(photo[both].mean(-1), other[row, column].mean(-1))[0, 1] > 0.8
+
+
+def test_a_made_drone_photo_says_where_it_was_taken_and_how_the_gimbal_stood(tmp_path):
+    yaw, pitch = np.array([37.0]), np.array([-90.0])
+    pose = made_aerial.poses_of(yaw, pitch, np.array([[10.0, 20.0, 62.0]]))[0]
+    path = tmp_path / "DJI_00001.JPG"
+    made_aerial.write_photo(path, pose, pose, 0, 64, 1, 0.0)
+    said = path.read_bytes()
+    assert b'GimbalYawDegree="+37.00"' in said
+    assert b'GimbalPitchDegree="-90.00"' in said
+    assert b'RelativeAltitude="+62.000"' in said

@@ -193,7 +193,9 @@ def _attitude_deg(world_from_cam: NDArray[np.float64]) -> tuple[float, float]:
 
 def _attitude(place: NDArray[np.float64], world_from_cam: NDArray[np.float64], maker: Maker) -> bytes:
     """An XMP packet as DJI writes it."""
-    yaw, pitch = _attitude_deg(world_from_cam)
+    pitch = _attitude_deg(world_from_cam)[1]
+    east, north = world_from_cam[:2, 0]
+    yaw = math.degrees(math.atan2(-north, east))  # of a level camera, also where it looks straight down
     said = {
         "AbsoluteAltitude": f"{place[2]:+.3f}",
         "RelativeAltitude": f"{place[2] - ORIGIN[2]:+.3f}",
