@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from biresnerf.data.model.untrusted_file import MAX_TEXT_BYTES, first_non_finite, read_json_object
+from biresnerf.data.model.untrusted_file import MAX_TEXT_BYTES, first_non_finite, read_bytes, read_json_object
 from biresnerf.errors import InputError
 from tests.data.regex_steps import counted_steps
 from tests.data.scenes import assert_complete
@@ -25,6 +25,15 @@ json_values = st.recursive(
 @pytest.fixture(scope="module")
 def file(tmp_path_factory):
     return tmp_path_factory.mktemp("json") / "transforms.json"
+
+
+def test_a_file_may_be_as_long_as_is_said_and_no_longer(tmp_path):
+    path = tmp_path / "images.bin"
+    path.write_bytes(b"x" * 1000)
+    assert read_bytes(path, 1000) == b"x" * 1000
+    with pytest.raises(InputError) as caught:
+        read_bytes(path, 999)
+    assert_complete(caught.value, "pose_file_invalid")
 
 
 @settings(max_examples=200, deadline=None)

@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from PIL import Image
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.model.dataset import Dataset, Frame, SourceFormat
 from biresnerf.data.photos.images import load_images
-from biresnerf.data.photos.masks import load_mask, refuse_unfit_mask, shrink_mask, write_masks
+from biresnerf.data.photos.masks import load_mask, mask_beside, refuse_unfit_mask, shrink_mask, write_masks
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
 from tests.data.scenes import HEIGHT, WIDTH, assert_complete, nerfstudio_scene, save, textured_arc
@@ -58,6 +59,23 @@ def test_black_does_not_count_and_all_else_does_in_every_form(tmp_path, form):
     path = tmp_path / ("mask.tif" if form in ("CMYK", "float") else "mask.png")
     _stored(PATTERN, form).save(path)
     assert np.array_equal(load_mask(_frame(path), CAMERA), PATTERN)
+    assert np.array_equal(load_mask(replace(_frame(path), mask_inverted=True), CAMERA), ~PATTERN)
+
+
+def test_a_mask_that_lies_ready_is_not_taken_from_outside_of_what_was_sent(tmp_path):
+    sent, other = tmp_path / "sent", tmp_path / "other.png"
+    _stored(PATTERN, "L").save(other)
+    for name in ("masks/a.jpg.png", "images/dynamic_mask_a.png"):
+        link = sent / name
+        link.parent.mkdir(parents=True)
+        link.symlink_to(other)
+        found = partial(mask_beside, sent, sent / "images/a.jpg", "images/a.jpg")
+        assert found(within=sent) == (None, False)
+        assert found(within=tmp_path)[0] == found()[0] == link
+        link.unlink()
+        link.write_bytes(other.read_bytes())
+        assert found(within=sent)[0] == link
+        link.unlink()
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".webp"])

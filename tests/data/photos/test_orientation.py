@@ -7,9 +7,17 @@ import pytest
 from PIL import Image, ImageOps
 
 from biresnerf.data.formats.read_dataset import read_dataset
-from biresnerf.data.photos.image_files import FocalPlane, ImageHeader
+from biresnerf.data.photos.guessed_lens import guess_lens
+from biresnerf.data.photos.image_files import FocalPlane, ImageHeader, MakerLens
 from biresnerf.data.photos.images import load_images
-from biresnerf.data.photos.orientation import INVERSE, meant_orientations, turned, turned_header, turned_size
+from biresnerf.data.photos.orientation import (
+    INVERSE,
+    meant_orientations,
+    shown_from_stored,
+    turned,
+    turned_header,
+    turned_size,
+)
 from tests.data.scenes import HEIGHT, WIDTH, nerfstudio_scene, save
 
 ORIENTATIONS = list(range(1, 9))
@@ -37,6 +45,26 @@ def test_turning_shows_a_picture_as_viewers_do(orientation):
     assert np.array_equal(turned(stored, orientation), shown)
     assert turned_size(6, 4, orientation) == (shown.shape[1], shown.shape[0])
     assert np.array_equal(turned(turned(stored, orientation), INVERSE[orientation]), stored)
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_the_upright_camera_sees_each_pixel_where_the_turned_picture_shows_it(orientation):
+    width, height, focal, x, y = 6, 4, 5.0, 4, 1
+    stored = np.zeros((height, width), dtype=np.uint8)
+    stored[y, x] = 1
+    shown = turned(stored, orientation)
+    in_stored = np.array([(x + 0.5 - width / 2) / focal, (y + 0.5 - height / 2) / focal, 1.0])
+    in_shown = shown_from_stored(orientation)[:3, :3] @ in_stored
+    column, row = in_shown[:2] * focal + np.array(shown.shape[::-1]) / 2
+    assert np.argwhere(shown).tolist() == [[int(row), int(column)]]
+
+
+def test_the_makers_lens_of_a_stored_picture_is_not_taken_for_that_of_the_turned_one():
+    measured = MakerLens(600.0, 500.0, 500.0, 30.0, -20.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    stored = ImageHeader(600, 400, orientation=6, maker_lens=measured)
+    assert guess_lens(stored)[1] == "maker"
+    upright, source = guess_lens(turned_header(stored, 6))
+    assert (upright.full().cx, upright.full().cy, source) == (200.0, 300.0, "guessed")
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".webp"])

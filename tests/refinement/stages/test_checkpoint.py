@@ -31,8 +31,6 @@ from biresnerf.report import TrialReport
 from biresnerf.stages import CHECKPOINT
 from tests.data.scenes import assert_complete
 
-pytestmark = pytest.mark.slow
-
 POSES = np.random.default_rng(0).normal(0, 1e3, (3, 4, 4)) / 3
 
 
@@ -125,6 +123,7 @@ def test_a_file_of_another_version_is_refused(tmp_path, metadata):
     assert_complete(caught.value, "checkpoint_invalid")
 
 
+@pytest.mark.slow
 def test_a_kill_in_the_middle_of_writing_leaves_the_old_checkpoint(tmp_path):
     save_checkpoint(tmp_path, checkpoint({"table": torch.zeros(5)}, step=1))
     killed = subprocess.run(

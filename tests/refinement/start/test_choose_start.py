@@ -25,8 +25,6 @@ from biresnerf.refinement.views import pose_trials
 from biresnerf.refinement.views.pose_trials import PoseTrials, trial_views
 from tests.refinement.tiny_scene import CPU, tiny_recipe, tiny_set, true_matches
 
-pytestmark = pytest.mark.slow
-
 VIEWS, MOVING = 9, 100
 
 
@@ -63,6 +61,7 @@ def chosen(scene, short) -> InitialPoses:
     return choose(images, candidates(dataset, noisy, dataset.world_from_cam))
 
 
+@pytest.mark.slow
 def test_good_matches_win_over_noisy_given_poses(scene, chosen):
     dataset, _ = scene
     assert chosen.source == "matches-incremental"
@@ -71,6 +70,7 @@ def test_good_matches_win_over_noisy_given_poses(scene, chosen):
     np.testing.assert_array_equal(pose_mobility(chosen), [[0.0] * VIEWS, [1.0] * VIEWS])
 
 
+@pytest.mark.slow
 def test_trials_end_once_one_is_clearly_better(scene, monkeypatch):
     monkeypatch.setattr(start_module, "TRIAL_STEPS", 120)
     dataset, images = scene
@@ -81,6 +81,7 @@ def test_trials_end_once_one_is_clearly_better(scene, monkeypatch):
     assert works == [2 * 120 / 4, 2 * (120 + MOVING)]
 
 
+@pytest.mark.slow
 def test_trials_end_once_photos_prefer_poses_that_alone_explain_the_matches(scene, monkeypatch):
     monkeypatch.setattr(start_module, "TRIAL_STEPS", 120)
     monkeypatch.setattr(start_module, "CLEAR_TRIAL", Rule(least=50.0, errors=0))
@@ -117,6 +118,7 @@ def test_right_poses_explain_matches_and_wrong_or_unmatched_ones_do_not(scene):
     )  # three photos unmatched
 
 
+@pytest.mark.slow
 def test_good_given_poses_win_over_wrong_matches(scene):
     dataset, images = scene
     wrong = perturb_poses(dataset.world_from_cam, 0.15, seed=2)
@@ -138,12 +140,14 @@ def test_without_matches_no_matched_poses_are_remembered(scene):
     assert kept.matched_poses is None
 
 
+@pytest.mark.slow
 def test_on_a_tie_the_given_poses_stay_if_matches_agree(scene):
     dataset, images = scene
     poses = dataset.world_from_cam
     assert choose(images, candidates(dataset, poses, poses.copy())).source == "given"
 
 
+@pytest.mark.slow
 def test_cameras_that_all_candidates_guess_have_no_say(scene):
     dataset, images = scene
     truth = dataset.world_from_cam
@@ -168,6 +172,7 @@ def test_cameras_that_all_candidates_guess_have_no_say(scene):
     assert len(found.matched_poses) == len(found.world_from_cam) == VIEWS
 
 
+@pytest.mark.slow
 def test_poses_that_may_move_in_a_trial_improve(scene):
     dataset, images = scene
     noisy = perturb_poses(dataset.world_from_cam, 0.05, seed=1)
@@ -178,6 +183,26 @@ def test_poses_that_may_move_in_a_trial_improve(scene):
     assert moved.scores().psnr.mean() > held.scores().psnr.mean() + 0.5
 
 
+@pytest.mark.parametrize(
+    ("scores", "explained", "decided"),
+    [
+        ([20.0, 22.1], [0.0, 0.0], True),  # clearly better, whatever matches say
+        ([20.0, 21.9], [0.0, 0.0], False),  # neither explains them
+        ([20.0, 20.4], [0.5, 0.95], True),  # photos prefer the one that alone explains them
+        ([20.0, 20.2], [0.5, 0.95], False),  # by too little
+        ([20.4, 20.0], [0.5, 0.95], False),  # photos and matches disagree
+        ([20.0, 20.4], [0.95, 0.95], True),  # no training will tell apart what both explain
+        ([20.0, 20.4, 20.3], [0.95, 0.95, 0.5], False),
+    ],
+)
+def test_a_trial_has_decided_once_photos_clearly_prefer_poses_or_matches_agree_with_them(
+    scores, explained, decided
+):
+    assert start_module._decided(scores, explained) == decided
+    assert start_module._decided(scores[::-1], explained[::-1]) == decided
+
+
+@pytest.mark.slow
 def test_where_poses_as_they_are_do_not_tell_those_win_that_improve_with_the_field(scene, monkeypatch):
     """As of a symmetric thing, whose matches give a model that is consistent but wrong."""
     dataset, images = scene
@@ -256,6 +281,7 @@ def test_a_stop_ends_the_trial(scene):
         choose_start(tried, images, [0.0, 0.0], tiny_recipe(), lambda: True)
 
 
+@pytest.mark.slow
 def test_a_start_survives_its_checkpoint(chosen):
     start = TypeAdapter(InitialPoses)
     back = start.validate_python(json.loads(json.dumps(start.dump_python(chosen))))

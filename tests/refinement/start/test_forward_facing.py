@@ -11,8 +11,6 @@ from biresnerf.refinement.start import forward_facing
 from biresnerf.refinement.start.forward_facing import find_forward_facing, mirrored, resemblance_psnr
 from tests.refinement.tiny_scene import photos_set, tiny_recipe, tiny_set
 
-pytestmark = pytest.mark.slow
-
 
 def small_rig(seed: int) -> np.ndarray:
     """Cameras near one place that look nearly the same way."""
@@ -70,6 +68,7 @@ def test_resemblance_is_that_of_the_best_mean_of_other_photos():
     assert resemblance_psnr(both, [0]) == pytest.approx(-20 * np.log10(1 / 255), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_cameras_around_a_scene_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(forward_facing, "FIRST_STEPS", 60)
     monkeypatch.setattr(forward_facing, "SECOND_STEPS", 30)

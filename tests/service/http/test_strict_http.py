@@ -8,6 +8,7 @@ import socket
 import time
 from typing import Any
 
+import h11
 import httpx
 import pytest
 
@@ -193,6 +194,22 @@ def test_more_headers_than_anybody_sends_are_refused(service: Running) -> None:
     assert most[0] == 200
     (more,) = answers_to(service, asking(101))
     assert more[0] == 431
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        b"X: a\n",
+        b"X: a\r\n b\r\n",
+        b"Content-Length: 1\r\nContent-Length: 1\r\n",
+        b"Content-Length: 1, 1\r\n",
+        b"X: a\r\n" * strict_http.HEADERS_MAX,
+    ],
+)
+def test_a_head_that_another_program_may_read_differently_is_refused(lines: bytes) -> None:
+    strict_http._Head().read(GET + HOST + b"Content-Length: 1\r\n\r\nX: a\n b\n")
+    with pytest.raises(h11.RemoteProtocolError):
+        strict_http._Head().read(GET + HOST + lines + b"\r\n")
 
 
 def test_each_byte_of_a_head_that_comes_byte_by_byte_is_searched_once() -> None:

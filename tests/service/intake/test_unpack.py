@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import stat
 import struct
 import sys
 import tarfile
@@ -94,6 +95,26 @@ def test_names_that_lead_out_leave_nothing_outside(tmp_path: Path, kind: str):
         unpack(request(tmp_path / "archive"))
     assert refused.value.code == "unsafe_path"
     assert not (tmp_path / "escaped.png").exists()
+
+
+@pytest.mark.parametrize("kind", [stat.S_IFLNK, stat.S_IFIFO, stat.S_IFCHR, stat.S_IFBLK, stat.S_IFSOCK])
+def test_an_entry_of_a_zip_that_is_no_file_is_refused(tmp_path: Path, kind: int):
+    with zipfile.ZipFile(tmp_path / "archive", "w") as archive:
+        info = zipfile.ZipInfo("odd")
+        info.external_attr = (kind | 0o644) << 16
+        archive.writestr(info, "/etc/passwd")
+    with pytest.raises(InputError, match="a link or a device"):
+        unpack(request(tmp_path / "archive"))
+
+
+@pytest.mark.parametrize("kind", [tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.FIFOTYPE, tarfile.CHRTYPE])
+def test_an_entry_of_a_tar_that_is_no_file_is_refused(tmp_path: Path, kind: bytes):
+    with tarfile.open(tmp_path / "archive", "w") as archive:
+        info = tarfile.TarInfo("odd")
+        info.type, info.linkname = kind, "/etc/passwd"
+        archive.addfile(info)
+    with pytest.raises(InputError, match="a link, a device or sparse"):
+        unpack(request(tmp_path / "archive"))
 
 
 def test_a_cut_tar_is_refused_though_its_files_are_whole(tmp_path: Path):

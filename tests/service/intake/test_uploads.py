@@ -3,15 +3,18 @@ from __future__ import annotations
 import asyncio
 import fcntl
 import itertools
+import os
 from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from starlette.requests import Request
+from starlette.types import Message
 
 from service.http.problems import ProblemError
-from service.intake.uploads import Form, capped, staging_folder, sweep_staging
+from service.intake.uploads import Form, capped, limited_body, staging_folder, sweep_staging
 
 
 async def pieces(content: bytes, cuts: list[int]) -> AsyncIterator[bytes]:
@@ -33,6 +36,19 @@ def test_a_body_that_stands_still_is_given_up() -> None:
     with pytest.raises(ProblemError) as caught:
         asyncio.run(read())
     assert (caught.value.status, caught.value.code) == (408, "body_timeout")
+
+
+def test_a_body_that_says_it_is_too_large_is_refused_before_a_byte_of_it_is_read() -> None:
+    async def unread() -> Message:
+        raise AssertionError("a byte was asked for")
+
+    def announced(size: int) -> Request:
+        return Request({"type": "http", "headers": [(b"content-length", str(size).encode())]}, unread)
+
+    limited_body(announced(100), 100)
+    with pytest.raises(ProblemError) as caught:
+        limited_body(announced(101), 100)
+    assert caught.value.code == "body_too_large"
 
 
 @given(st.binary(max_size=200), st.lists(st.integers(0, 500), max_size=6), st.integers(0, 250))
@@ -103,7 +119,8 @@ def test_staging_folders_go_away_with_their_use_and_after_a_crash(tmp_path: Path
     async def use() -> None:
         async with staging_folder(tmp_path) as folder:
             (folder / "archive").write_bytes(b"x")
-            assert sweep_staging(tmp_path) == 0  # in use
+            os.utime(folder, (0, 0))
+            assert sweep_staging(tmp_path) == 0  # in use, however long
 
     asyncio.run(use())
     assert list(tmp_path.iterdir()) == []

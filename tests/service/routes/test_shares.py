@@ -13,6 +13,8 @@ import httpx
 import pytest
 from psycopg.types.json import Jsonb
 
+from service.http.problems import ProblemError
+from service.routes.shares import _require_signature, _signature
 from tests.service.conftest import problem
 from tests.service.in_process import serving
 from tests.workers.buckets import environment_of, fresh_bucket, moto_server
@@ -52,6 +54,24 @@ async def result(http: httpx.AsyncClient, settings: Settings, content: bytes) ->
             *(Jsonb([{**artifact, "media_type": "image/png"}]), job),
         )
     return str(job)
+
+
+def test_a_signature_is_of_one_file_of_one_job_until_one_time_in_one_round_and_by_one_key():
+    signed = (b"key", "job_1", NAME, 1000, 0)
+    others = [(b"other", *signed[1:]), (b"key", "job_2", *signed[2:]), (*signed[:2], "report.json", 1000, 0)]
+    others += [(*signed[:3], 1001, 0), (*signed[:4], 1)]
+    assert len({_signature(*each) for each in (signed, *others)}) == 6
+    made = _signature(*signed)
+    for given, expires, code in (
+        (made, 0, "link_expired"),
+        (made[:-1], 2**40, "not_found"),
+        (_signature(*others[0]), 2**40, "not_found"),
+        ("ü", 2**40, "not_found"),
+    ):
+        with pytest.raises(ProblemError) as caught:
+            _require_signature(made, expires, given)
+        assert caught.value.code == code
+    _require_signature(made, int(time.time()) + 60, made)
 
 
 async def test_a_link_opens_one_file_for_its_time_and_nothing_else(settings: Settings):
