@@ -28,7 +28,7 @@ from biresnerf.field.occupancy import DeviceOccupancyGrid
 from biresnerf.field.radiance_field import Marching, PositionGradient, Rays, Rendering
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.refinement.optimise import renderer
-from biresnerf.refinement.optimise.joint_optimiser import OCCUPANCY_PERIOD, JointOptimiser
+from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.parameters import pose_parameters
 
 GPU = torch.device("meta")
@@ -130,7 +130,7 @@ def traced_step(optimiser: JointOptimiser, *, looks_at_cells: bool = False) -> T
         patch.object(torch, "rand", lambda *size, generator=None, **where: rand(*size, **where)),
         patch.object(torch, "randint", lambda *size, generator=None, **where: randint(*size, **where)),
     ):
-        made.step_index = 2 * OCCUPANCY_PERIOD - (1 if looks_at_cells else 0)
+        made.step_index = 2 * made.schedule.numbers.occupancy_period - (1 if looks_at_cells else 0)
         made.step()
         made.rays, recorder.trace = rays, Trace()
         with recorder:

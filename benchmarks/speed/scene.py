@@ -11,7 +11,7 @@ from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.synthetic.scene import render_synthetic, synthetic_cameras, synthetic_focal
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.options.refine_options import RefineOptions
-from biresnerf.refinement.optimise.joint_optimiser import OCCUPANCY_PERIOD, JointOptimiser
+from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.scene.scene_frame import scene_frame
 
@@ -86,7 +86,7 @@ def step(joint: JointOptimiser, rays: int) -> int:
     Returns its samples before any were merged.
     """
     index = joint.step_index
-    joint.step_index += index % OCCUPANCY_PERIOD == 0
+    joint.step_index += index % joint.schedule.numbers.occupancy_period == 0
     result = joint.step()
     joint.step_index, joint.rays = index, rays
     return result.samples

@@ -15,7 +15,7 @@ from benchmarks.speed.clock import Clock, interleave, peak_memory, ratio, summar
 from biresnerf.field.cpu import field as cpu_field
 from biresnerf.field.reference.field import ReferenceField
 from biresnerf.refinement.optimise import joint_step
-from biresnerf.refinement.optimise.joint_optimiser import OCCUPANCY_PERIOD, JointOptimiser
+from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.photo_sampler import PhotoSampler
 from biresnerf.refinement.parameters.pose_parameters import PoseParameters
 
@@ -61,7 +61,8 @@ def _cells_s(ours: JointOptimiser, rounds: int, clock: Clock) -> dict[str, float
         {"estimate": lambda: looked(estimate), "density": lambda: looked(by_density)}, rounds, clock
     )
     ours.occupancy.load_state(kept)
-    return {name: float(np.median(each)) / OCCUPANCY_PERIOD for name, each in seconds.items()}
+    period = ours.schedule.numbers.occupancy_period
+    return {name: float(np.median(each)) / period for name, each in seconds.items()}
 
 
 def _definition(ours: JointOptimiser) -> JointOptimiser:

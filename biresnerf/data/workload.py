@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.panoramas.cut_panoramas import as_views
+from biresnerf.data.scene_kind import SceneKind
 from biresnerf.data.seeding.map_images import (
     ALL_PAIRS_UP_TO,
     BY_LIKENESS,
@@ -36,12 +37,6 @@ PICTURE_STEPS, PICTURE_SHARE = 200, 1.5
 # Times the verdict's steps, to choose between photos and matches: shorter trials cannot tell wrong poses that agree
 # with each other from bent ones (docs/estimator.md).
 PHOTO_TRIALS = 2
-# Until a field of an open scene has formed, good poses predict unseen views no better than bad ones (fountain-P11: no
-# difference after 200 steps, 4 dB after 400).
-OPEN_STEPS = 2  # times the steps of a scene with a background
-OPEN_STEP = 1.6  # times the work of a step of one, as measured (docs/speed.md)
-# As measured (docs/speed.md): the rendering of an open scene (entry-P10, lund_door) against one with a background.
-OPEN_EVALUATION = 2.0
 # Thousands of observations of tracks that take as long as what an adjustment does without any: surfaces, patches, and
 # their choice, which are bounded. lego at 100 px, fountain-P11, temple and fox (4, 35, 58 and 87 thousand) take 7.0,
 # 6.9, 10.6 to 16.6, and 11.0 to 12.1 s.
@@ -73,16 +68,16 @@ class Workload:
     share: float
 
 
-def workload(dataset: Dataset, options: ResolvedOptions, *, unbounded: bool, adjusts: bool) -> Workload:
+def workload(dataset: Dataset, options: ResolvedOptions, *, kind: SceneKind, adjusts: bool) -> Workload:
     """All of a run, as far as it is known before its features are.
 
     Args:
-        unbounded: whether photos show surroundings.
+        kind: of the scene.
         adjusts: whether all cameras are adjusted at the end.
     """
     dataset = as_views(dataset)
     matched = options.start in ("auto", "colmap") and can_match()
-    weights = step_weights(options, unbounded=unbounded)
+    weights = step_weights(options, kind=kind)
     share = steps_share(matched=matched and adjusts)
     coarse = options.coarse_steps_max
     amounts: dict[Phase, float] = {
@@ -96,10 +91,10 @@ def workload(dataset: Dataset, options: ResolvedOptions, *, unbounded: bool, adj
         amounts |= matching_work([features] * len(dataset), pairs)
         observations = OBSERVED * features * len(dataset)
     if matched and options.start == "auto" and dataset.posed.any():
-        amounts["trying"] = LOOKS[0] * _trial(TRIAL_STEPS, unbounded=unbounded)
+        amounts["trying"] = LOOKS[0] * _trial(TRIAL_STEPS, kind=kind)
     # Mostly, matches start the run and move cameras little after it: photos need not judge that.
     adjusting = 2 * (ADJUSTMENT + observations / 1000) if adjusts else 0.0
-    amounts |= after_steps(options, unbounded, adjusting=adjusting, checks=False)
+    amounts |= after_steps(options, kind, adjusting=adjusting, checks=False)
     return Workload(amounts, weights, share)
 
 
@@ -108,9 +103,9 @@ def can_be_adjusted(count: int) -> bool:
     return LEAST_ADJUSTED <= count <= MOST_ADJUSTED
 
 
-def step_weights(options: ResolvedOptions, *, unbounded: bool) -> dict[Phase, float]:
+def step_weights(options: ResolvedOptions, *, kind: SceneKind) -> dict[Phase, float]:
     """Work of a step in either stage."""
-    weight = options.samples_per_step / SAMPLES * (OPEN_STEP if unbounded else 1.0)
+    weight = options.samples_per_step / SAMPLES * kind.step_work
     return {"coarse": weight, "fine": weight * (0.5 + options.reconstruction_levels / 16)}
 
 
@@ -120,23 +115,23 @@ def steps_share(*, matched: bool) -> float:
 
 
 def after_steps(
-    options: ResolvedOptions, unbounded: bool, *, adjusting: float, checks: bool
+    options: ResolvedOptions, kind: SceneKind, *, adjusting: float, checks: bool
 ) -> dict[Phase, float]:
     """Work in the phases after the steps."""
-    trial = _trial(options.trial_steps, unbounded=unbounded)
-    pictured = picture_share(options.trial_steps, unbounded=unbounded)
+    trial = _trial(options.trial_steps, kind=kind)
+    pictured = picture_share(options.trial_steps, kind=kind)
     return {
         "adjusting": adjusting,
-        "checking": photo_check(options, unbounded=unbounded) if checks else 0.0,
-        "evaluating": OPEN_EVALUATION if unbounded else 1.0,
+        "checking": photo_check(options, kind=kind) if checks else 0.0,
+        "evaluating": kind.evaluation_work,
         # the first look of the first round decides mostly, and its fields are trained on for their pictures
         "judging": options.verdict * (JUDGING + pictured * trial),
     }
 
 
-def photo_check(options: ResolvedOptions, *, unbounded: bool) -> float:
+def photo_check(options: ResolvedOptions, *, kind: SceneKind) -> float:
     """Work of the trainings by which photos judge adjusted cameras."""
-    return PHOTO_TRIALS * _trial(options.trial_steps, unbounded=unbounded)
+    return PHOTO_TRIALS * _trial(options.trial_steps, kind=kind)
 
 
 def _search(dataset: Dataset, effort: SeedingEffort) -> tuple[float, float, float]:
@@ -166,12 +161,12 @@ def matching_work(features: Sequence[float], pairs: float) -> dict[Phase, float]
     }
 
 
-def picture_share(trial_steps: int, *, unbounded: bool) -> float:
+def picture_share(trial_steps: int, *, kind: SceneKind) -> float:
     """How much of a training it takes to show what a field has learned; 1 is the whole."""
-    steps = trial_steps * (OPEN_STEPS if unbounded else 1)
+    steps = trial_steps * kind.trial_steps
     return max(LOOKS[0], min(PICTURE_STEPS / max(steps, 1), PICTURE_SHARE))
 
 
-def _trial(steps: int, *, unbounded: bool) -> float:
+def _trial(steps: int, *, kind: SceneKind) -> float:
     """Work of two trainings of so many steps."""
-    return 2 * steps * (OPEN_STEPS * OPEN_STEP if unbounded else 1.0)
+    return 2 * steps * kind.trial_steps * kind.step_work

@@ -14,6 +14,7 @@ from biresnerf.data.model.dataset import Dataset, Frame
 from biresnerf.data.photos.images import ImageSet, load_images
 from biresnerf.data.photos.masks import mask_place
 from biresnerf.data.photos.panoramas.cut_panoramas import as_views
+from biresnerf.data.scene_kind import SceneKinds
 from biresnerf.data.show.view_pictures import CELL_PX, THUMBNAIL_PX, write_contact_sheet, write_thumbnail
 from biresnerf.data.workload import can_be_adjusted, workload
 from biresnerf.forecast.rates import latest_machine, machine_rates
@@ -93,7 +94,7 @@ def expected_seconds(dataset: Dataset, *, unbounded: bool) -> dict[PresetName, t
     found: dict[PresetName, tuple[float, float]] = {}
     for preset in PRESETS:
         options = RefineOptions(preset=preset).resolved(device)
-        work = workload(dataset, options, unbounded=unbounded, adjusts=adjusts)
+        work = workload(dataset, options, kind=SceneKinds().of(unbounded), adjusts=adjusts)
         found[preset] = rates.between(work.amounts)
     return found
 

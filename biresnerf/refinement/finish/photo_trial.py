@@ -52,7 +52,9 @@ def photos_object(scene: Scene, joint: JointParameters, recipe: Recipe, run: Run
         logger.info("the adjusted cameras moved by %.2f px, which photos do not show", moved)
         return False
     run.announce("checking the adjusted cameras by the photos")
-    work = photo_check(recipe.options, unbounded=joint.frame.unbounded)  # known by now, if not before
+    work = photo_check(
+        recipe.options, kind=recipe.method.kinds.of(joint.frame.unbounded)
+    )  # known by now, if not before
     forecast = run.monitor.forecast
     with run.timed("adjusting", "checking", work):
         found = compare_placed(

@@ -41,9 +41,9 @@ def expect_run(forecast: Forecast, dataset: Dataset, recipe: Recipe) -> None:
     """All of a run, as far as it is known before its features are."""
     options = recipe.options
     few = replace(dataset, frames=dataset.frames[:PHOTOS_LOOKED_AT])
-    unbounded = load_images(few, SMALL, options.background).background is None
+    kind = recipe.method.kinds.of(load_images(few, SMALL, options.background).background is None)
     adjusts = adjusts_cameras(as_views(dataset), recipe.method)
-    work = workload(dataset, options, unbounded=unbounded, adjusts=adjusts)
+    work = workload(dataset, options, kind=kind, adjusts=adjusts)
     forecast.plan(work.step_weights, work.share)
     forecast.expect(work.amounts)
 
@@ -55,7 +55,7 @@ def expect_rest(scene: Scene, optimiser: JointOptimiser, run: RunState) -> None:
     forecast.continues(sum(run.record.seconds.values()))
     adjusts = adjusts_cameras(scene.dataset, optimiser.method)
     share = steps_share(matched=scene.tracks is not None and adjusts)
-    forecast.plan(step_weights(optimiser.options, unbounded=optimiser.frame.unbounded), share)
+    forecast.plan(step_weights(optimiser.options, kind=optimiser.schedule.kind), share)
     forecast.expect(work_ahead(scene, optimiser, run), alone=True)
 
 
@@ -77,18 +77,18 @@ def work_ahead(
     Args:
         checks: what `checks_ahead` says, where it was asked already.
     """
-    unbounded = optimiser.frame.unbounded
+    kind = optimiser.schedule.kind
     options = options or optimiser.schedule.options
     step, switch = optimiser.step_index, optimiser.switch
     coarse, fine = run.steps_left(step, switch, options.steps, options.coarse_steps_max)
-    weights = step_weights(options, unbounded=unbounded)
+    weights = step_weights(options, kind=kind)
     adjusts, first = adjusts_cameras(scene.dataset, optimiser.method), not run.record.adjusted
     each = adjustment(scene) if adjusts else 0.0
     checks = checks_ahead(scene, optimiser, run) if checks is None else checks
     return {
         "coarse": coarse * weights["coarse"],
         "fine": fine * weights["fine"],
-        **after_steps(options, unbounded, adjusting=(first + run.record.adjusts_again) * each, checks=checks),
+        **after_steps(options, kind, adjusting=(first + run.record.adjusts_again) * each, checks=checks),
     }
 
 

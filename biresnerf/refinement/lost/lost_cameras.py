@@ -26,25 +26,10 @@ from biresnerf.refinement.scene.shared_views import shared_shares
 
 logger = logging.getLogger(__name__)
 
-SCORE_SIDE = 20  # a pose is scored on 20 x 20 pixels spread over the photo
-REFERENCES = 16  # cameras that stand for all others in the acceptance
 CHUNK = 4096  # rays rendered at once
 SCORED_AT_ONCE = 10  # poses
-ROUNDS = ((6, 48, 40), (2, 128, 50))  # poses kept, rays a step of each, steps
-RATES = (1e-2, 1e-3)  # pose learning rate of the first and the last step
-DISTINCT_DEG = 8.0  # poses nearer than this to a better one are not tried beside it
-LEAST_INTERVAL = 1.2e-2  # unit lengths: scoring needs no finer samples
-NEAR_MEDIAN = 1.5  # times the others' median error, below which a camera is one of them
+ALONE_SIDE = 8  # a view shares what 8 x 8 pixels of it show
 NO_ERROR = 1e-12
-ALONE = 0.2  # sharing less of its view than this, a camera of an open scene must go elsewhere, however small its error
-ALONE_SIDE = 8  # as seen by 8 x 8 pixels
-ALONE_MOST = 0.2  # of all cameras: where more are alone, the photos were taken so
-FIRST_SHARE = 0.5  # of the least length of stage 1: the field has formed (open scenes: all of it)
-LAST_SHARE = 0.6  # of all steps: the repair within stage 2
-SETTLED_SHARE = 1 / 3  # of stage 2, at the least before that
-RUN_SHARE, EVENT_SHARE = 0.1, 0.04  # of the run's samples: what all repairs may cost, and those of one time
-GUESSED_TIMES = 2  # that much where poses are guesses: more cameras need it
-FORWARD_COST = 0.4  # of a sample without its backward pass
 
 
 class MatchedRepair:
@@ -63,10 +48,10 @@ class MatchedRepair:
             return []
         optimiser, placed = self.optimiser, []
         errors = self._own.errors_px(optimiser.poses.poses().numpy())
-        wrong = contradicted(errors) & optimiser.bodies.alone
+        wrong = contradicted(errors, optimiser.method.lost) & optimiser.bodies.alone
         trusted = ~(wrong | optimiser.camera_errors.suspects.cpu().numpy())
         for camera in np.argsort(-np.nan_to_num(errors) * wrong)[: int(wrong.sum())].tolist():
-            found = self._own.placed(camera, optimiser.poses.poses().numpy(), trusted)
+            found = self._own.placed(camera, optimiser.poses.poses().numpy(), trusted, optimiser.method.lost)
             logger.info(
                 "the matches of camera %d are off by %.3g px and %s",
                 camera, errors[camera], "place it elsewhere" if found is not None else "do not place it",
@@ -103,6 +88,7 @@ class LostCameraRepair:
 
     def __init__(self, optimiser: JointOptimiser, own: OwnMatches | None = None) -> None:
         self.optimiser, self._matches = optimiser, MatchedRepair(optimiser, own)
+        self._numbers = optimiser.method.lost
         self.repaired: list[int] = []
         self._marching = optimiser.marching(optimiser.schedule.fine_interval)
         self._given = optimiser.poses.poses().numpy()
@@ -116,10 +102,10 @@ class LostCameraRepair:
             return False
         if optimiser.switch is None:
             least = float(options.coarse_steps_min)
-            points = [least] if optimiser.frame.unbounded else [FIRST_SHARE * least, least]
+            points = [share * least for share in optimiser.schedule.kind.repairs]
             return self._times < len(points) and optimiser.step_index >= points[self._times]
-        steps = optimiser.schedule.steps
-        late = max(LAST_SHARE * steps, optimiser.switch + SETTLED_SHARE * (steps - optimiser.switch))
+        steps, switch, numbers = optimiser.schedule.steps, optimiser.switch, self._numbers
+        late = max(numbers.last_share * steps, switch + numbers.settled_share * (steps - switch))
         return self._times < 4 and optimiser.step_index >= late
 
     def run(self, *, switching: bool = False) -> None:
@@ -129,8 +115,8 @@ class LostCameraRepair:
             return
         self._times = 3 if switching else self._times + 1 if optimiser.switch is None else 4
         total = float(optimiser.schedule.samples(optimiser.schedule.steps, 0)) * optimiser.schedule.steps
-        total *= GUESSED_TIMES if bool(optimiser.camera_errors.doubted.any()) else 1
-        allowance = min(self._spent + EVENT_SHARE * total, RUN_SHARE * total)
+        total *= self._numbers.guessed_times if bool(optimiser.camera_errors.doubted.any()) else 1
+        allowance = min(self._spent + self._numbers.event_share * total, self._numbers.run_share * total)
         self._marching = self._coarse_marching()
         self.place_by_matches()
         alone = self._alone()
@@ -155,12 +141,13 @@ class LostCameraRepair:
         """Mask [n] of training cameras that look where almost no other does: their error cannot show it."""
         optimiser = self.optimiser
         alone = torch.zeros(len(optimiser.poses), dtype=torch.bool, device=optimiser.device)
-        if not optimiser.frame.unbounded:
-            return alone  # the scene ends at its box, and a camera that looks elsewhere sees nothing
+        least = optimiser.schedule.kind.alone
+        if not least:
+            return alone
         cameras = torch.arange(len(alone), device=optimiser.device)
-        unshared = self._shared(optimiser.poses.matrices(), cameras) < ALONE
+        unshared = self._shared(optimiser.poses.matrices(), cameras) < least
         unshared &= ~optimiser.camera_errors.held_out
-        return unshared if float(unshared.float().mean()) <= ALONE_MOST else alone
+        return unshared if float(unshared.float().mean()) <= self._numbers.alone_most else alone
 
     @torch.no_grad()
     def _shared(self, matrices: Tensor, image: Tensor) -> Tensor:
@@ -171,7 +158,7 @@ class LostCameraRepair:
             xy = self._grid(image[owner], ALONE_SIDE)
             origin, direction = optimiser.renderer.cast(matrices[owner], image[owner], xy)
             rendering = self._render(matrices[owner], image[owner], xy, PositionGradient())
-            self._spent += FORWARD_COST * rendering.samples
+            self._spent += self._numbers.forward_cost * rendering.samples
             points.append((origin + rendering.depth[:, None] * direction).reshape(len(part), -1, 3))
         return shared_shares(
             torch.cat(points), image, optimiser.poses.matrices(), optimiser.lenses.intrinsics
@@ -190,14 +177,15 @@ class LostCameraRepair:
         trusted = torch.nonzero(~suspects & ~self.optimiser.camera_errors.held_out)[:, 0]
         if len(trusted) == 0:
             return 0.0
-        chosen = trusted[torch.linspace(0, len(trusted) - 1, min(REFERENCES, len(trusted))).long()]
+        count = min(self._numbers.references, len(trusted))
+        chosen = trusted[torch.linspace(0, len(trusted) - 1, count).long()]
         return float(self._scores(self.optimiser.poses.matrices()[chosen], chosen).median())
 
     def _repair(self, camera: int, median: float, trusted: Tensor, *, alone: bool) -> None:
         optimiser = self.optimiser
         now = optimiser.poses.poses().numpy()
         hypotheses = pose_hypotheses(
-            self._given, now, camera, trusted.cpu().numpy(), optimiser.photo_distances[camera]
+            self._given, now, camera, trusted.cpu().numpy(), optimiser.photo_distances[camera], self._numbers
         )
         tried = torch.from_numpy(np.concatenate([now[camera : camera + 1], hypotheses])[:, :3])
         tried = tried.float().to(optimiser.device)
@@ -207,18 +195,18 @@ class LostCameraRepair:
         # A guess need not be clearly beaten.
         rule = ANY_GAIN if bool(optimiser.camera_errors.doubted[camera]) else REPAIRED
         if alone:  # its own error says nothing, nor does that of another pose that shares no view
-            shared = self._shared(tried, image) >= ALONE
+            shared = self._shared(tried, image) >= optimiser.schedule.kind.alone
             if not bool(shared.any()):
                 return
             tried, scores = tried[shared], scores[shared]
-        for keep, rays, steps in ROUNDS:
-            chosen = _distinct(tried, scores, keep)
+        for keep, rays, steps in self._numbers.rounds:
+            chosen = _distinct(tried, scores, keep, self._numbers.distinct_deg)
             tried = self._optimised(tried[chosen], camera, rays, steps)
             scores = self._scores(tried, image[: len(tried)])
             best = int(scores.argmin())
             error = float(scores[best])
             gain = octaves(old, error, NO_ERROR)
-            accepted = near = error < NEAR_MEDIAN * median
+            accepted = near = error < self._numbers.near_median * median
             if not alone:
                 accepted = is_better(gain, rule) and (near or is_better(gain, FAR_REPAIRED))
             accepted = accepted and not self._matches.object_to(camera, tried[best])
@@ -231,27 +219,28 @@ class LostCameraRepair:
         if accepted:
             optimiser.replace_pose(camera, tried[best])
             self.repaired = sorted({*self.repaired, camera})
-        elif old < NEAR_MEDIAN * median and not alone:
+        elif old < self._numbers.near_median * median and not alone:
             optimiser.camera_errors.believe(camera)  # nothing better was found than where it stands
 
     @torch.no_grad()
     def _scores(self, matrices: Tensor, image: Tensor) -> Tensor:
         """Mean squared error [k] of photos `image` [k] seen from poses [k, 3, 4], on a fixed grid of pixels."""
         optimiser = self.optimiser
-        owner = torch.arange(len(image), device=optimiser.device).repeat_interleave(SCORE_SIDE**2)
+        side = self._numbers.score_side
+        owner = torch.arange(len(image), device=optimiser.device).repeat_interleave(side**2)
         rays = image[owner]
-        xy = self._grid(rays, SCORE_SIDE)
+        xy = self._grid(rays, side)
         target = optimiser.sampler.colours(rays, xy, self._blur())
         counting = optimiser.sampler.counting(rays, xy)
         errors = []
-        for part in torch.arange(len(rays), device=optimiser.device).split(SCORED_AT_ONCE * SCORE_SIDE**2):
+        for part in torch.arange(len(rays), device=optimiser.device).split(SCORED_AT_ONCE * side**2):
             rendering = self._render(matrices[owner[part]], rays[part], xy[part], PositionGradient())
-            self._spent += FORWARD_COST * rendering.samples
+            self._spent += self._numbers.forward_cost * rendering.samples
             colour = optimiser.exposure.refitted(
                 rendering,
                 target[part],
                 None if counting is None else counting[part],
-                len(part) // SCORE_SIDE**2,
+                len(part) // side**2,
             )
             errors.append(((colour - target[part]) ** 2).mean(1))
         squared = torch.cat(errors).reshape(len(image), -1)
@@ -270,7 +259,7 @@ class LostCameraRepair:
         count = len(matrices) * rays
         owner = torch.arange(len(matrices), device=optimiser.device).repeat_interleave(rays)
         image = torch.full((count,), camera, device=optimiser.device)
-        first, last = RATES
+        first, last = self._numbers.rates
         for step in range(steps):
             xy = optimiser.sampler.random_pixels(image, optimiser.generator)
             target = optimiser.sampler.colours(image, xy, self._blur())
@@ -305,7 +294,7 @@ class LostCameraRepair:
         """Coarser samples than the run's, and one more cell around occupied ones: gradients begin there."""
         optimiser = self.optimiser
         interval = optimiser.schedule.interval(optimiser.step_index, optimiser.switch)
-        marching = optimiser.marching(max(interval, LEAST_INTERVAL))
+        marching = optimiser.marching(max(interval, self._numbers.least_interval))
         occupied = torch.nn.functional.max_pool3d(
             marching.occupied[None, None].float(), 3, stride=1, padding=1
         )
@@ -320,13 +309,12 @@ class LostCameraRepair:
             self.optimiser.free(camera)
 
 
-def _distinct(matrices: Tensor, scores: Tensor, keep: int) -> Tensor:
-    """Indices of the `keep` best poses [k, 3, 4] of which no two are turned by less than `DISTINCT_DEG`."""
+def _distinct(matrices: Tensor, scores: Tensor, keep: int, apart_deg: float) -> Tensor:
+    """Indices of the `keep` best poses [k, 3, 4] of which no two are turned by less than `apart_deg`."""
     rotations = matrices[:, :, :3].double().cpu().numpy()
     chosen: list[int] = []
     for i in scores.argsort(stable=True).tolist():
-        apart = rotation_between_deg(rotations[chosen], rotations[i])
-        if bool((apart >= DISTINCT_DEG).all()):
+        if bool((rotation_between_deg(rotations[chosen], rotations[i]) >= apart_deg).all()):
             chosen.append(i)
         if len(chosen) == keep:
             break

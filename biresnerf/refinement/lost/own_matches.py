@@ -15,17 +15,12 @@ from biresnerf.geometry.epipolar import epipolar_angles
 from biresnerf.geometry.resection import resect
 from biresnerf.geometry.triangulation import parallax_deg, triangulate
 from biresnerf.judging.compare import ANY_GAIN, is_better, octaves
+from biresnerf.refinement.numbers.lost import LostNumbers
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.scene.scene_depth import track_rays
 
 LEAST_PAIRS = 8  # of an image's observations with others; fewer say nothing of it
 LEAST_PX = 0.05  # errors below it are equal: features are not that exact
-# Errors of an image beyond so many times the median image's contradict its pose. The largest of any camera of fountain-
-# P11, lego at 200 px, temple, fox and the demo scene, at true poses and at noise of 0.005 and 0.15: 3.6.
-TIMES_USUAL = 8.0
-# Times the median image's error: how near to its feature a point must appear to agree with a pose.
-AGREE = 4.0
-LEAST_PARALLAX_DEG = 1.0  # of points that a camera is placed by
 
 
 class OwnMatches:
@@ -56,7 +51,9 @@ class OwnMatches:
         errors = angles * (self.focal_px[a] + self.focal_px[b]) / 2
         return _medians(np.concatenate([a, b]), np.tile(errors, 2), len(self.focal_px))
 
-    def placed(self, camera: int, world_from_cam: Array, trusted: NDArray[np.bool_]) -> Array | None:
+    def placed(
+        self, camera: int, world_from_cam: Array, trusted: NDArray[np.bool_], numbers: LostNumbers
+    ) -> Array | None:
         """The camera's pose [4, 4] by points that trusted cameras [n] see, at poses [n, 4, 4]; none of those left out.
 
         None where too few points agree, or where its own matches do not fit the pose found better than the present one.
@@ -64,7 +61,7 @@ class OwnMatches:
         before = self.errors_px(world_from_cam)
         others = trusted.copy()
         others[camera] = False
-        bound_px = AGREE * _usual(before[others])
+        bound_px = numbers.agree * _usual(before[others])
         shared = np.zeros(self.tracks.points, dtype=np.bool_)
         shared[self.tracks.point[self.tracks.image == camera]] = True
         shared &= ~self.tracks.left_out()
@@ -78,7 +75,7 @@ class OwnMatches:
         directions = np.einsum("mij,mj->mi", world_from_cam[image, :3, :3], self.rays[used])
         origins = world_from_cam[image, :3, 3]
         xyz = triangulate(origins, directions, self.focal_px[image], row, len(points))
-        wide = parallax_deg(origins, xyz, row) >= LEAST_PARALLAX_DEG
+        wide = parallax_deg(origins, xyz, row) >= numbers.least_parallax_deg
         own = np.flatnonzero((self.tracks.image == camera) & np.isin(self.tracks.point, points))
         found = resect(xyz[wide], self.rays[own[wide]], bound_px / self.focal_px[camera], seed=camera)
         if found is None:
@@ -107,9 +104,9 @@ def _medians(image: NDArray[np.int64], errors: Array, count: int) -> Array:
     return medians
 
 
-def contradicted(errors_px: Array) -> NDArray[np.bool_]:
+def contradicted(errors_px: Array, numbers: LostNumbers) -> NDArray[np.bool_]:
     """Cameras [n] whose own matches fit far worse than the set's, by their errors [n]."""
-    return np.asarray(np.nan_to_num(errors_px) > TIMES_USUAL * _usual(errors_px))
+    return np.asarray(np.nan_to_num(errors_px) > numbers.times_usual * _usual(errors_px))
 
 
 def better(camera: int, before_px: Array, after_px: Array) -> bool:

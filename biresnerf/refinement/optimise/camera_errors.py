@@ -2,28 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.refinement.kernels.batch_errors import add_errors
+from biresnerf.refinement.numbers.optimise import ErrorNumbers
 
-STANDS_OUT = 2.0  # times the median error
-STANDS_OUT_UNTRAINED = 4.0  # for held-out views too few to be compared with each other
-DEVIATIONS = 4.0  # and this many standard deviations, estimated as 1.4826 x the median absolute deviation
-SUSPECT_DEVIATIONS = 2.0  # enough to try other poses, which are judged on their own
-# A photo that is hard to render stands out late in a run, when others are nearly exact (0.03 at most on lego and
-# temple); a camera in a wrong place leaves this share of its photo's variance unexplained (0.12 and more there).
-UNEXPLAINED = 0.08
-# Few photos predict an unseen one badly from good poses, too: ten of fountain-P11 leave 0.28 of the eleventh.
-UNEXPLAINED_UNTRAINED = 0.7
 MAD_TO_DEVIATION = 1.4826
-OWN_YARDSTICK_FROM = 4  # held-out views
-IN_A_ROW = 2  # blocks
-COVERAGE = 0.1  # of the photo's foreground share: a camera that renders less no longer sees the scene
-DOUBTED_WEIGHT = 0.1  # of a camera with a guessed pose, until it agrees with the field
-SMOOTHING = 0.5  # share of the newest block in the moving average
 BACKGROUND_TOLERANCE = 0.05  # colours nearer to the background than this count as background
 LEAST_FOREGROUND = 0.02
 
@@ -53,24 +42,22 @@ def _counted(values: np.ndarray, images: ImageSet, index: int) -> np.ndarray:
     return values.reshape(-1, *values.shape[2:]) if counts is None else values[counts]
 
 
-def outliers(
-    errors: Tensor, held_out: Tensor, deviations: float = DEVIATIONS, untrained: float = STANDS_OUT_UNTRAINED
-) -> Tensor:
+def outliers(errors: Tensor, held_out: Tensor, numbers: ErrorNumbers = ErrorNumbers()) -> Tensor:
     """Mask [n] of the errors [n] that stand out.
 
     Held-out views, which the field never saw, are measured by their own median where there are enough of them;
-    else they must exceed `untrained` times that of the others.
+    else they must exceed `stands_out_untrained` times that of the others.
     """
     training = errors[~held_out]
     median, spread = _middle(training)
-    result = errors > torch.maximum(STANDS_OUT * median, median + deviations * spread)
+    result = errors > torch.maximum(numbers.stands_out * median, median + numbers.deviations * spread)
     if bool(held_out.any()):
-        factor, own = untrained, errors[held_out]
-        if len(own) >= OWN_YARDSTICK_FROM:
-            factor = STANDS_OUT
+        factor, own = numbers.stands_out_untrained, errors[held_out]
+        if len(own) >= numbers.own_yardstick_from:
+            factor = numbers.stands_out
             own_median, own_spread = _middle(own)
             median, spread = torch.maximum(median, own_median), torch.maximum(spread, own_spread)
-        bound = torch.maximum(factor * median, median + deviations * spread)
+        bound = torch.maximum(factor * median, median + numbers.deviations * spread)
         result = torch.where(held_out, errors > bound, result)
     return result
 
@@ -93,13 +80,19 @@ class CameraErrors:
         shares: see `foreground_shares`.
         errors: moving average [n] over blocks; infinite where there is none yet.
         doubted: mask [n] of cameras that began at a guess and have not yet agreed with the field of the others.
-        lost: mask [n] of cameras that stood out for `IN_A_ROW` blocks, and of those in doubt.
+        lost: mask [n] of cameras that stood out for some blocks in a row, and of those in doubt.
         weights: of each camera's rays in the loss [n], None where all weigh the same.
         sums: of the present block [n, 3]: rays, squared errors, opacities.
     """
 
-    def __init__(self, images: ImageSet, held_out: list[int], device: torch.device) -> None:
-        count = len(images)
+    def __init__(
+        self,
+        images: ImageSet,
+        held_out: list[int],
+        device: torch.device,
+        numbers: ErrorNumbers = ErrorNumbers(),
+    ) -> None:
+        count, self._numbers = len(images), numbers
         self.shares = torch.from_numpy(foreground_shares(images)).float().to(device)
         variances = [
             _counted(images.image(i) / np.float32(255), images, i).var(0).mean() for i in range(count)
@@ -117,12 +110,16 @@ class CameraErrors:
 
     @property
     def lost(self) -> Tensor:
-        return (self._stood_out >= IN_A_ROW) | self.doubted
+        return (self._stood_out >= self._numbers.in_a_row) | self.doubted
 
     @property
     def suspects(self) -> Tensor:
         """Mask [n] of cameras that other poses should be tried for: the lost ones, and those that nearly are."""
-        return self.lost | self._outliers(SUSPECT_DEVIATIONS, STANDS_OUT)
+        numbers = self._numbers
+        looser = replace(
+            numbers, deviations=numbers.suspect_deviations, stands_out_untrained=numbers.stands_out
+        )
+        return self.lost | self._outliers(looser)
 
     @property
     def relative(self) -> Tensor:
@@ -136,7 +133,7 @@ class CameraErrors:
         if bool(self.lost.any()):
             known = self.errors.isfinite()
             weights = torch.where(known, 1 / self.relative.clamp(min=1), torch.ones_like(self.errors))
-            weights = torch.where(self.doubted, weights.clamp(max=DOUBTED_WEIGHT), weights)
+            weights = torch.where(self.doubted, weights.clamp(max=self._numbers.doubted_weight), weights)
             weights = torch.where(self.lost, weights, torch.ones_like(weights))
             # In its place, as recorded steps read it.
             self.weights = weights if before is None else before.copy_(weights)
@@ -172,22 +169,23 @@ class CameraErrors:
         rays, squared, opacity = self.sums.unbind(1)
         measured = rays > 0
         block = squared / rays.clamp(min=1) / self.shares
-        smoothed = torch.where(self.errors.isfinite(), self.errors + SMOOTHING * (block - self.errors), block)
+        newest = self._numbers.smoothing
+        smoothed = torch.where(self.errors.isfinite(), self.errors + newest * (block - self.errors), block)
         self.errors = torch.where(measured, smoothed, self.errors)
-        out = self._outliers(DEVIATIONS, STANDS_OUT_UNTRAINED)
-        if 0 < int(self.held_out.sum()) < OWN_YARDSTICK_FROM:
-            out &= ~self.held_out | (self.errors > UNEXPLAINED_UNTRAINED * self._variances)
+        out = self._outliers(self._numbers)
+        if 0 < int(self.held_out.sum()) < self._numbers.own_yardstick_from:
+            out &= ~self.held_out | (self.errors > self._numbers.unexplained_untrained * self._variances)
         if self.bounded:
-            out |= measured & (opacity / rays.clamp(min=1) < COVERAGE * self.shares)
+            out |= measured & (opacity / rays.clamp(min=1) < self._numbers.coverage * self.shares)
         self._stood_out = torch.where(out, self._stood_out + 1, torch.zeros_like(self._stood_out))
         self.sums.zero_()
         self._weigh()
 
-    def _outliers(self, deviations: float, untrained: float) -> Tensor:
+    def _outliers(self, numbers: ErrorNumbers) -> Tensor:
         known = self.errors.isfinite()
         out = torch.zeros_like(known)
-        out[known] = outliers(self.errors[known], self.held_out[known], deviations, untrained)
-        return out & (self.errors > UNEXPLAINED * self._variances)
+        out[known] = outliers(self.errors[known], self.held_out[known], numbers)
+        return out & (self.errors > self._numbers.unexplained * self._variances)
 
     def forget(self, camera: int) -> None:
         """Reset one camera, after its pose was replaced."""

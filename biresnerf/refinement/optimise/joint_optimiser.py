@@ -32,7 +32,6 @@ from biresnerf.refinement.scene.scene_frame import SceneFrame
 MOST_SAMPLES = 768  # per ray
 RAYS_MOST = 1 << 15
 FIRST_SAMPLES = 64  # per ray, as guessed for the first step
-OCCUPANCY_PERIOD = 16
 
 
 class JointOptimiser:
@@ -70,10 +69,10 @@ class JointOptimiser:
         self.field = self.method.build_field(options, frame, device, threads)
         self.lenses = lenses or IntrinsicsParameters.held(images.cameras, device)
         self.poses = poses if poses is not None else self._pose_parameters(torch.from_numpy(unit_from_cam))
-        self.schedule = self.method.schedule(options, frame.pixel, frame.unbounded, frame.distance)
+        self.schedule = self.method.scheduled(options, frame)
         self._images = images
         self.sampler = sampler or PhotoSampler(images, held_out, device, self.method.by_detail)
-        self.camera_errors = CameraErrors(images, held_out, device)
+        self.camera_errors = CameraErrors(images, held_out, device, self.method.errors)
         self.directions, self.metrics = directions_for(device), AsyncMetrics(device)
         self.occupancy = make_occupancy(self.method.occupancy_side(options), device)
         self.generator = torch.Generator().manual_seed(options.seed)
@@ -162,7 +161,7 @@ class JointOptimiser:
         """One step of the joint optimisation."""
         t, schedule = self.step_index, self.schedule
         self.field.reach(t / schedule.steps)
-        if t % OCCUPANCY_PERIOD == 0 and self.method.pruned:
+        if t % schedule.numbers.occupancy_period == 0 and self.method.pruned:
             self._update_occupancy(t)
         told = self._numbers()
         done = joint_step(self.renderer, self.sampler, self.camera_errors, self.method, told)

@@ -40,9 +40,16 @@ def _with(holder: Any, path: list[str], value: Any, asked: str) -> Any:
 
 def differences(recipe: Recipe) -> dict[str, str]:
     """What differs from the method that the options name: functions and classes by name, other values as text."""
-    named = find_method(recipe.options.method)
-    own, other = ({name: getattr(m, name) for name in _names(m)} for m in (recipe.method, named))
-    return {name: _text(value) for name, value in own.items() if value != other.get(name)}
+    own, named = recipe.method, find_method(recipe.options.method)
+    each = (_between(getattr(own, name), getattr(named, name, None), name) for name in _names(own))
+    return {name: text for found in each for name, text in found.items()}
+
+
+def _between(own: Any, other: Any, name: str) -> dict[str, str]:
+    if type(own) is type(other) and is_dataclass(own) and not callable(own):
+        parts = ((getattr(own, each), getattr(other, each), f"{name}.{each}") for each in _names(own))
+        return {name: text for part in parts for name, text in _between(*part).items()}
+    return {} if own == other else {name: _text(own)}
 
 
 def _names(holder: Any) -> list[str]:

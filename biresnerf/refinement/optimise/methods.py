@@ -12,11 +12,14 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from biresnerf.data.scene_kind import SceneKinds
 from biresnerf.field.backends import make_field
 from biresnerf.field.grid_levels import GridLevels, grid_levels
 from biresnerf.field.radiance_field import FieldShape, Merging, RadianceField
 from biresnerf.options.presets import MethodName
 from biresnerf.options.refine_options import ResolvedOptions
+from biresnerf.refinement.numbers.lost import LostNumbers
+from biresnerf.refinement.numbers.optimise import ErrorNumbers, ScheduleNumbers, SwitchNumbers
 from biresnerf.refinement.optimise.schedule import Schedule
 from biresnerf.refinement.scene.scene_frame import SceneFrame
 
@@ -53,6 +56,8 @@ class Method:
         merging: how intervals that give little light are merged, if they are.
         rays_least: fewest rays a step.
         by_detail: share of the rays that are drawn in proportion to the photos' detail, see `PixelChances`.
+        course, errors, switch, kinds, lost: numbers of the schedule, of cameras that stand out, of the switch to
+            stage 2, of open scenes, and of lost cameras.
     """
 
     build_field: BuildField
@@ -75,6 +80,15 @@ class Method:
     merging: Merging | None = None
     rays_least: int = 256
     by_detail: float = 0.0
+    course: ScheduleNumbers = ScheduleNumbers()
+    errors: ErrorNumbers = ErrorNumbers()
+    switch: SwitchNumbers = SwitchNumbers()
+    kinds: SceneKinds = SceneKinds()
+    lost: LostNumbers = LostNumbers()
+
+    def scheduled(self, options: ResolvedOptions, frame: SceneFrame) -> Schedule:
+        """The schedule of a run in a scene."""
+        return self.schedule(options, frame.pixel, frame.unbounded, frame.distance, self.course, self.kinds)
 
 
 def half_squared_error(colour: Tensor, target: Tensor) -> Tensor:

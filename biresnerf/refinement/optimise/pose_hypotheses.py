@@ -11,10 +11,8 @@ from biresnerf.data.photos.area_resize import area_resize
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.geometry.lie import so3_exp
 from biresnerf.geometry.similarity import align_robust
+from biresnerf.refinement.numbers.lost import LostNumbers
 
-NEIGHBOURS = 8  # cameras whose correction is tried, and cameras whose place is tried
-ORBITS_DEG = (10, 20, 30, 45, 60)
-ROLLS_DEG = (-20, 20, -90, 90, 180)  # also photos stored on their side or upside down
 THUMBNAIL = 16  # px
 
 
@@ -42,7 +40,9 @@ def _thumbnail(images: ImageSet, index: int, width: int, height: int) -> tuple[N
     return colour.ravel(), share.repeat(3, axis=2).ravel()
 
 
-def pose_hypotheses(given: Array, now: Array, camera: int, trusted: NDArray[np.bool_], far: Array) -> Array:
+def pose_hypotheses(
+    given: Array, now: Array, camera: int, trusted: NDArray[np.bool_], far: Array, numbers: LostNumbers
+) -> Array:
     """Poses [h, 4, 4] that `camera` may have.
 
     Args:
@@ -63,13 +63,14 @@ def pose_hypotheses(given: Array, now: Array, camera: int, trusted: NDArray[np.b
     else:
         carried = align_robust(given[others], now[others], with_rotations=True).apply_to_poses(given)
         start = carried[camera]
-    near = others[np.argsort(_apart(carried[others], start), kind="stable")[:NEIGHBOURS]]
-    alike = others[np.argsort(far[others], kind="stable")[:NEIGHBOURS]]
+    near = others[np.argsort(_apart(carried[others], start), kind="stable")[: numbers.neighbours]]
+    alike = others[np.argsort(far[others], kind="stable")[: numbers.neighbours]]
     corrections = now[near] @ np.linalg.inv(carried[near])
-    found = [start[None], corrections @ start, now[alike], _orbits(start), _rolled(start)]
+    orbits, rolled = _orbits(start, numbers.orbits_deg), _rolled(start, numbers.rolls_deg)
+    found = [start[None], corrections @ start, now[alike], orbits, rolled]
     half_turns = np.stack([np.diag([-1.0, 1, -1, 1]), np.diag([1.0, -1, -1, 1])])
     facing = _facing_centre(start)
-    found += [start @ half_turns, facing[None], _rolled(facing)]
+    found += [start @ half_turns, facing[None], _rolled(facing, numbers.rolls_deg)]
     return np.concatenate(found)
 
 
@@ -80,17 +81,17 @@ def _apart(poses: Array, pose: Array) -> Array:
     return np.hypot(centres, np.linalg.norm(poses[:, :3, 2] - pose[:3, 2], axis=1))
 
 
-def _orbits(pose: Array) -> Array:
+def _orbits(pose: Array, orbits_deg: tuple[float, ...]) -> Array:
     """The camera turned about the origin: around its own horizontal and vertical axis, and around both."""
-    angles = [sign * angle for angle in ORBITS_DEG for sign in (-1, 1)]
+    angles = [sign * angle for angle in orbits_deg for sign in (-1, 1)]
     turns = [(a, 0) for a in angles] + [(0, a) for a in angles]
     turns += [(a, b) for a in (-20, 20) for b in (-20, 20)]
     return _turn(np.radians(turns) @ pose[:3, :2].T) @ pose
 
 
-def _rolled(pose: Array) -> Array:
+def _rolled(pose: Array, rolls_deg: tuple[float, ...]) -> Array:
     """The camera turned about its optical axis."""
-    return pose @ _turn(np.radians(ROLLS_DEG)[:, None] * np.array([0.0, 0, 1]))
+    return pose @ _turn(np.radians(rolls_deg)[:, None] * np.array([0.0, 0, 1]))
 
 
 def _facing_centre(pose: Array) -> Array:

@@ -14,16 +14,9 @@ from typing import Literal
 import numpy as np
 
 from biresnerf.frozen_model import FrozenModel
+from biresnerf.refinement.numbers.optimise import SwitchNumbers
 
 Verdict = Literal["running", "stable", "cap"]
-
-LEAST_CHECKS = 6  # before anything is said: three in the later half make a line with a deviation
-LEVEL_SHARE = 0.15  # of all that was gained: what the later half may bring, or scatter by
-CONFIRMATIONS = 2  # checks in a row
-STILL_DEG = 0.05  # 90 % quantile of rotation change per block below which cameras have settled
-# Adam's steps have the size of the learning rate whatever the gradient: settled cameras still stagger by about
-# rate * sqrt(steps) in a block. Measured on settled rigs: 1.2 to 1.5 times that; while they move, 3 and more.
-STAGGER = 1.7
 
 
 class DetectorState(FrozenModel):
@@ -39,14 +32,13 @@ class StabilityDetector:
 
     Attributes:
         floor, cap: no switch before step `floor`; always at step `cap`.
-        motion_deg: how calm cameras must be for STABLE: the 90 % quantile of their rotation within the block.
         guarded: whether moving cameras put the switch off, which is not in the paper.
     """
 
     floor: int
     cap: int
-    motion_deg: float = STILL_DEG
     guarded: bool = True
+    numbers: SwitchNumbers = SwitchNumbers()
     decibels: list[float] = field(default_factory=list)
     confirmed: int = 0
 
@@ -56,31 +48,32 @@ class StabilityDetector:
 
     def still_deg(self, pose_rate: float, steps: int) -> float:
         """Rotation within a block of `steps` steps that settled cameras may show at this learning rate (rad)."""
-        return max(self.motion_deg, STAGGER * math.degrees(pose_rate) * math.sqrt(steps))
+        return max(self.numbers.still_deg, self.numbers.stagger * math.degrees(pose_rate) * math.sqrt(steps))
 
     def check(
         self, step: int, mean_squared_error: float, moved_deg: float, still_deg: float | None = None
     ) -> Verdict:
         """One block's result at `step`. `moved_deg`: 90 % quantile of the cameras' rotation during the block."""
         self.decibels.append(-10 * math.log10(max(mean_squared_error, 1e-12)))
-        still = moved_deg < (still_deg or self.motion_deg) or not self.guarded
+        still = moved_deg < (still_deg or self.numbers.still_deg) or not self.guarded
         self.confirmed = self.confirmed + 1 if still and self._level() else 0
         if step >= self.cap:
             return "cap"
-        return "stable" if self.confirmed >= CONFIRMATIONS and step >= self.floor else "running"
+        return "stable" if self.confirmed >= self.numbers.confirmations and step >= self.floor else "running"
 
     def signal(self) -> dict[str, float]:
         """Its figures for curves: what the later half of the checks gained, and what counts as level, dB."""
-        if len(self.decibels) < LEAST_CHECKS:
+        if len(self.decibels) < self.numbers.least_checks:
             return {"confirmed": self.confirmed}
         trend, _, gained = self._later_half()
-        return {"trend_db": trend, "level_db": max(0.0, LEVEL_SHARE * gained), "confirmed": self.confirmed}
+        level = max(0.0, self.numbers.level_share * gained)
+        return {"trend_db": trend, "level_db": level, "confirmed": self.confirmed}
 
     def _level(self) -> bool:
-        if len(self.decibels) < LEAST_CHECKS:
+        if len(self.decibels) < self.numbers.least_checks:
             return False
         trend, scatter, gained = self._later_half()
-        return max(abs(trend), scatter) <= LEVEL_SHARE * gained
+        return max(abs(trend), scatter) <= self.numbers.level_share * gained
 
     def _later_half(self) -> tuple[float, float, float]:
         """Gain of the later half, standard deviation about its line, and gain since the first check; dB."""

@@ -77,7 +77,8 @@ class TwoStages:
     ) -> None:
         self.optimiser, self.repair, self.run = optimiser, repair, run
         self._at_check, self._write_preview = at_check, write_preview
-        self.detector = StabilityDetector(0, 0, guarded=optimiser.method.guard)
+        method = optimiser.method
+        self.detector = StabilityDetector(0, 0, method.guard, method.switch)
         self._take_lengths()
         self._previews = PreviewTimer(optimiser.options.checkpoint_every_s)
         self._reported = self._saved = 0.0

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.errors import InputError, Interrupted
-from biresnerf.judging.compare import FACING_FORWARD, FACING_FORWARD_BOUNDED, is_better
+from biresnerf.judging.compare import is_better
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.scene.scene_frame import scene_frame
@@ -65,8 +65,7 @@ def find_forward_facing(
     logger.info("forward-facing: %.2f dB, mirrored in depth %.2f dB", tries[0][1], tries[1][1])
     best, psnr = max(tries, key=lambda found: found[1])
     bound = resemblance_psnr(images, unseen)
-    rule = FACING_FORWARD if frame.unbounded else FACING_FORWARD_BOUNDED
-    if not is_better(psnr - bound, rule):
+    if not is_better(psnr - bound, recipe.method.kinds.of(frame.unbounded).facing_forward):
         raise InputError(
             "insufficient_overlap",
             f"no poses were found that explain the photos: a scene built from some predicts others at {psnr:.1f} "

@@ -22,6 +22,7 @@ from biresnerf.refinement.finish.gather_evidence import measured_evidence
 from biresnerf.refinement.finish.outcome import Finish
 from biresnerf.refinement.lost.own_matches import contradicted
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.optimise.methods import Method
 from biresnerf.refinement.parameters.joint_parameters import JointParameters
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.run_state import RunState
@@ -65,7 +66,7 @@ class Judgement:
         epipolar_px: before and after [2, n]; NaN where there are too few matches.
         renders: of some held-out views, in the verdict's training on the input's poses and on the refined ones.
         sharpness, gain: see `image_flags`.
-        contradicted, moved_far, blurred, exposure_off: bool.
+        contradicted, contradicted_before, moved_far, blurred, exposure_off: bool.
         errors: what the evidence says of those of the refined poses; None where it says nothing, or nobody had to know.
     """
 
@@ -76,6 +77,7 @@ class Judgement:
     sharpness: Array
     gain: Array
     contradicted: NDArray[np.bool_]
+    contradicted_before: NDArray[np.bool_]
     moved_far: NDArray[np.bool_]
     blurred: NDArray[np.bool_]
     exposure_off: NDArray[np.bool_]
@@ -141,7 +143,7 @@ def judge_poses(
     run.monitor.forecast.took(JUDGING + work)
     verdict = decide(replace(told, heldout=heldout.evidence if heldout else None))
     gain = image_flags.gains(optimiser.renderer, optimiser.sampler, optimiser.generator)
-    return replace(_with_images(verdict, scene, gain, found, heldout), errors=errors)
+    return replace(_with_images(verdict, scene, gain, found, heldout, optimiser.method), errors=errors)
 
 
 def _determined(errors: ExpectedErrors | None, finish: Finish) -> float | None:
@@ -256,6 +258,7 @@ def _with_images(
     gain: Array,
     found: Compared,
     heldout: HeldOutComparison | None,
+    method: Method,
 ) -> Judgement:
     images = scene.images
     trial_psnr, epipolar_px = np.full((2, len(images)), np.nan), np.full((2, len(images)), np.nan)
@@ -273,7 +276,8 @@ def _with_images(
         epipolar_px=epipolar_px,
         sharpness=sharpness,
         gain=gain,
-        contradicted=contradicted(epipolar_px[1]),
+        contradicted=contradicted(epipolar_px[1], method.lost),
+        contradicted_before=contradicted(epipolar_px[0], method.lost),
         moved_far=image_flags.moved_far(found.turned, found.shifted, distance),
         blurred=image_flags.blurred(sharpness),
         exposure_off=image_flags.exposure_off(gain),

@@ -9,7 +9,6 @@ from biresnerf.data.model.dataset import Dataset
 from biresnerf.geometry.focus import focus_point, rms_spread
 from biresnerf.refinement.finish.expected_errors import ExpectedErrors
 from biresnerf.refinement.finish.outcome import Finish
-from biresnerf.refinement.lost.own_matches import contradicted
 from biresnerf.refinement.parameters.joint_parameters import JointParameters
 from biresnerf.refinement.start.refined_poses import RefinedPoses
 from biresnerf.refinement.verdict.judgement import Judgement
@@ -38,10 +37,9 @@ def pose_uncertainty(
     """
     refined = RefinedPoses.now(dataset, joint)
     poses, found = refined.world_from_cam, None if judgement is None else judgement.errors
-    errors_px = np.full((2, len(dataset)), np.nan) if judgement is None else judgement.epipolar_px
-    wrong = contradicted(errors_px[1])
+    wrong = np.zeros(len(dataset), np.bool_) if judgement is None else judgement.contradicted
     if judgement is not None and judgement.verdict.returned == "input":
-        poses, found, wrong = dataset.world_from_cam, None, contradicted(errors_px[0])
+        poses, found, wrong = dataset.world_from_cam, None, judgement.contradicted_before
     if found is None and finish.fit is not None and np.isfinite(poses).all():
         found = finish.fit.errors_of(poses, refined.input_from_unit(joint.frame), joint.bodies)
     reasons = [

@@ -123,7 +123,7 @@ def compare_on_unseen_views(
         running = [trials.begin(rig.world_from_cam, rig.lenses(images)) for rig in pair]
         seen = seen + views
         pictured = effort.pictured and not done
-        enough = picture_share(steps, unbounded=trials.frame.unbounded) if pictured else 0.0
+        enough = picture_share(steps, kind=trials.kind) if pictured else 0.0
         for look in effort.looks:
             for side, trial in enumerate(running):
                 trial.train(look)

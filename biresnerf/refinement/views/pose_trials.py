@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.photos.images import ImageSet
-from biresnerf.data.workload import OPEN_STEP, OPEN_STEPS
 from biresnerf.errors import Interrupted
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
@@ -60,7 +59,7 @@ class PoseTrials:
         unseen: indices of the views that no field is trained on.
         rigs: sets of poses [n, 4, 4] that together define the scene box; in one frame.
         recipe: the field's sizes and rates, and how it is trained.
-        steps: of each training; an open scene takes `OPEN_STEPS` times as many.
+        steps: of each training; an open scene takes more.
         should_stop: called after every step.
     """
 
@@ -76,7 +75,8 @@ class PoseTrials:
     ) -> None:
         self.images, self.unseen = images, list(unseen)
         self.frame = scene_frame(np.concatenate(list(rigs)), images)
-        self.steps = steps * (OPEN_STEPS if self.frame.unbounded else 1)
+        self.kind = recipe.method.kinds.of(self.frame.unbounded)
+        self.steps = steps * self.kind.trial_steps
         # All of it stage 1, and the rates fall to their end: with the rates of a longer run's first half, trainings on
         # the same poses differ by 0.25 dB from seed to seed (lego at 100 px, 200 steps), so by 0.04.
         self._recipe = recipe.apart(self.steps, (self.steps, self.steps), SAMPLES)
@@ -131,7 +131,7 @@ class Trial:
     @property
     def work(self) -> float:
         """Of the steps so far, in steps of a scene with a background."""
-        return self.optimiser.step_index * (OPEN_STEP if self.optimiser.frame.unbounded else 1.0)
+        return self.optimiser.step_index * self.optimiser.schedule.kind.step_work
 
     def scores(self) -> TrialScores:
         """How well the field predicts the unseen views by now. The more steps, the more pixels are rendered."""

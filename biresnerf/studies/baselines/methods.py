@@ -20,13 +20,7 @@ from biresnerf.refinement.optimise.methods import (
     squared_error,
     two_grids,
 )
-from biresnerf.refinement.optimise.schedule import (
-    EMPTY_LOOKED_AT,
-    NEAR_SHARES,
-    POSE_DIP,
-    Schedule,
-    smooth_ramp,
-)
+from biresnerf.refinement.optimise.schedule import Schedule, smooth_ramp
 from biresnerf.refinement.scene.scene_frame import SceneFrame
 from biresnerf.studies.baselines.mlp_field import MlpField
 
@@ -55,7 +49,7 @@ class PlainSchedule(Schedule):
         return False
 
     def empty_cells_looked_at(self, step: int) -> float:
-        return 1.0 if step < self.first_looks * self.steps else EMPTY_LOOKED_AT
+        return 1.0 if step < self.first_looks * self.steps else self.numbers.empty_looked_at
 
     def pose_rate(self, step: int, switch: int | None) -> float:
         return self._decayed_pose_rate(step / self.steps)
@@ -76,7 +70,8 @@ class PaperSchedule(PlainSchedule):
 
     def pose_rate(self, step: int, switch: int | None) -> float:
         rate = super().pose_rate(step, switch)
-        return rate if switch is None else rate * (POSE_DIP + (1 - POSE_DIP) * self._warmed(step, switch))
+        dip = self.numbers.pose_dip
+        return rate if switch is None else rate * (dip + (1 - dip) * self._warmed(step, switch))
 
     def field_rates(self, step: int, switch: int | None) -> FieldRates:
         rates = super().field_rates(step, switch)
@@ -108,7 +103,7 @@ class BarfSchedule(OneStageSchedule):
         return NERFACC_BARF_INTERVAL * self.distance / RIG_DISTANCE
 
     def near(self, step: int, switch: int | None) -> float:
-        return NEAR_SHARES[1] if self.unbounded else BARF_NEAR
+        return self.numbers.near_shares[1] if self.unbounded else BARF_NEAR
 
     def far(self, far: float) -> float:
         return far if self.unbounded else BARF_FAR * self.distance

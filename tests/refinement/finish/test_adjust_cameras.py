@@ -290,7 +290,7 @@ def test_no_field_is_trained_where_cameras_moved_by_less_than_photos_show(tmp_pa
         "compare_placed",
         lambda *given: trained.append((given[-1].looks, forecast.left["checking"])),
     )
-    work = photo_check(run.optimiser.options, unbounded=run.optimiser.frame.unbounded)
+    work = photo_check(run.optimiser.options, kind=run.optimiser.schedule.kind)
     for deviation, expected in ((1e-4, []), (0.1, [((1.0,), work)])):
         other = disturbed(present, rng, deviation, deviation)
         joint, recipe = run.optimiser.joint, run.optimiser.recipe

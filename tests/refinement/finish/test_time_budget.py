@@ -5,6 +5,7 @@ import time
 
 import pytest
 
+from biresnerf.data.scene_kind import SceneKind
 from biresnerf.data.workload import FIRST_ROUND, LEARNING
 from biresnerf.forecast.run_forecast import RATES
 from biresnerf.refinement.finish.work_ahead import (
@@ -35,7 +36,7 @@ def begun(scene, folder, **changed):
 
 def with_step_of(run, seconds):
     """As if steps of stage 1 took so long, and those of stage 2 twice as long; all else nothing."""
-    weights = run.forecast.step_weights = step_weights(run.optimiser.options, unbounded=False)
+    weights = run.forecast.step_weights = step_weights(run.optimiser.options, kind=SceneKind())
     run.forecast.rates = dict.fromkeys(RATES, 0.0) | {
         "coarse step": seconds / weights["coarse"],
         "fine step": 2 * seconds / weights["fine"],

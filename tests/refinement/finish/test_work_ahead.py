@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from biresnerf.data.points.tracks import Tracks
+from biresnerf.data.scene_kind import SceneKind
 from biresnerf.data.workload import FIRST_ROUND, JUDGING, LEARNING, step_weights, workload
 from biresnerf.forecast.run_forecast import Forecast
 from biresnerf.geometry.perturb import perturb_poses
@@ -43,7 +44,7 @@ def run_of(scene, tmp_path):
 def test_with_tracks_fewer_steps_are_taken_and_adjusted_cameras_are_checked(run_of):
     short, long = run_of(), run_of(TRACKS)
     assert (short.forecast.share, long.forecast.share) == (1.0, FIRST_ROUND + LEARNING)
-    weight = step_weights(short.optimiser.options, unbounded=False)["fine"]
+    weight = step_weights(short.optimiser.options, kind=SceneKind())["fine"]
     assert short.forecast.left["fine"] == pytest.approx(20 * weight)
     assert long.forecast.left["fine"] == pytest.approx(10 * weight)
     assert short.forecast.left["checking"] == 0 < long.forecast.left["checking"]
@@ -106,7 +107,7 @@ def test_mapping_is_more_work_where_photos_have_more_features(scene):
     def mapping(times: int) -> float:
         cameras = tuple(c.resized(times * c.width, times * c.height) for c in scene[0].cameras)
         enlarged = replace(scene[0], cameras=cameras)
-        return workload(enlarged, tiny_options(start="auto"), unbounded=False, adjusts=True).amounts[
+        return workload(enlarged, tiny_options(start="auto"), kind=SceneKind(), adjusts=True).amounts[
             "mapping"
         ]
 

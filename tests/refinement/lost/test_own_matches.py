@@ -12,8 +12,10 @@ from biresnerf.geometry.epipolar import epipolar_angles
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.refinement.lost.own_matches import LEAST_PAIRS, OwnMatches, contradicted
+from biresnerf.refinement.numbers.lost import LostNumbers
 from tests.data.formats.random_sets import random_poses
 
+NUMBERS = LostNumbers()
 CAMERA = Camera("SIMPLE_RADIAL", 640, 480, (600.0, 320.0, 240.0, 0.02))
 
 
@@ -43,9 +45,9 @@ def without(poses: np.ndarray, camera: int, seed: int) -> np.ndarray:
 def test_the_matches_of_a_lost_camera_name_it_alone_and_bring_it_back(seed):
     poses, own = rig(seed, wrong=0.15)
     lost = without(poses, 3, seed)
-    wrong = contradicted(own.errors_px(lost))
+    wrong = contradicted(own.errors_px(lost), NUMBERS)
     assert np.flatnonzero(wrong).tolist() == [3]
-    found = own.placed(3, lost, ~wrong)
+    found = own.placed(3, lost, ~wrong, NUMBERS)
     assert rotation_between_deg(found[:3, :3], poses[3, :3, :3]) < 0.5
     assert np.linalg.norm(found[:3, 3] - poses[3, :3, 3]) < 0.03
 
@@ -54,29 +56,29 @@ def test_it_is_brought_back_to_where_the_others_are_with_their_own_errors():
     poses, own = rig(5)
     near = perturb_poses(poses, 0.003, seed=1)
     lost = without(near, 7, 5)
-    found = own.placed(7, lost, np.arange(12) != 7)
+    found = own.placed(7, lost, np.arange(12) != 7, NUMBERS)
     assert rotation_between_deg(found[:3, :3], poses[7, :3, :3]) < 1.5
 
 
 def test_true_poses_are_contradicted_nowhere_and_nothing_better_is_found():
     poses, own = rig(6, wrong=0.2)
     errors = own.errors_px(poses)
-    assert not contradicted(errors).any()
+    assert not contradicted(errors, NUMBERS).any()
     assert errors.max() < 2.0
-    found = own.placed(2, poses, np.ones(12, bool))
+    found = own.placed(2, poses, np.ones(12, bool), NUMBERS)
     assert found is None or rotation_between_deg(found[:3, :3], poses[2, :3, :3]) < 0.3
 
 
 def test_too_few_matches_or_wrong_ones_or_no_trusted_cameras_place_nothing():
     poses, own = rig(7, points=6)
-    assert own.placed(0, poses, np.ones(12, bool)) is None
+    assert own.placed(0, poses, np.ones(12, bool), NUMBERS) is None
     poses, own = rig(8, wrong=1.0)
-    assert own.placed(0, poses, np.ones(12, bool)) is None
+    assert own.placed(0, poses, np.ones(12, bool), NUMBERS) is None
     poses, own = rig(9)
-    assert own.placed(0, poses, np.zeros(12, bool)) is None
+    assert own.placed(0, poses, np.zeros(12, bool), NUMBERS) is None
     together = np.repeat(poses[:1], 12, axis=0)  # no parallax
-    assert own.placed(0, together, np.ones(12, bool)) is None
-    assert not contradicted(own.errors_px(together)).any()
+    assert own.placed(0, together, np.ones(12, bool), NUMBERS) is None
+    assert not contradicted(own.errors_px(together), NUMBERS).any()
 
 
 def test_observations_that_were_left_out_place_no_camera():
@@ -87,7 +89,9 @@ def test_observations_that_were_left_out_place_no_camera():
     assert judging.sum() > 5
     moved = tracks.xy + 40.0 * judging[:, None]
     changed = OwnMatches(Tracks.of(tracks.point, tracks.image, moved), [CAMERA] * 12)
-    np.testing.assert_array_equal(changed.placed(4, lost, trusted), own.placed(4, lost, trusted))
+    np.testing.assert_array_equal(
+        changed.placed(4, lost, trusted, NUMBERS), own.placed(4, lost, trusted, NUMBERS)
+    )
 
 
 def test_each_cameras_error_is_the_median_over_its_own_pairs():

@@ -10,6 +10,7 @@ from biresnerf.data.synthetic.scene import synthetic_cameras
 from biresnerf.geometry.lie import so3_exp
 from biresnerf.geometry.pose_error import rotation_angle_deg
 from biresnerf.geometry.similarity import Similarity
+from biresnerf.refinement.numbers.lost import LostNumbers
 from biresnerf.refinement.optimise.pose_hypotheses import photo_distances, pose_hypotheses
 from tests.refinement.tiny_scene import photos_set
 
@@ -52,7 +53,7 @@ def spoiled(pose: np.ndarray) -> np.ndarray:
 )
 def test_the_true_pose_is_among_them_or_near(wrong, within_deg):
     poses = spoiled(wrong)
-    found = pose_hypotheses(poses, poses, LOST, ALL, LIKENESS)
+    found = pose_hypotheses(poses, poses, LOST, ALL, LIKENESS, LostNumbers())
     assert nearest_deg(found, TRUTH[LOST]) <= within_deg
 
 
@@ -61,7 +62,7 @@ def test_the_given_pose_follows_the_frame_that_the_others_have_drifted_to():
     now = drift.apply_to_poses(TRUTH)
     wandered = now.copy()
     wandered[LOST] = now[0]
-    found = pose_hypotheses(TRUTH, wandered, LOST, ALL, LIKENESS)
+    found = pose_hypotheses(TRUTH, wandered, LOST, ALL, LIKENESS, LostNumbers())
     np.testing.assert_allclose(found[0], now[LOST], atol=1e-9)
 
 
@@ -71,7 +72,7 @@ def test_corrections_of_neighbours_are_tried():
     given = TRUTH.copy()
     near = np.argsort(LIKENESS)[:12]
     given[near] = off @ TRUTH[near]
-    found = pose_hypotheses(given, spoiled(given[LOST]), LOST, ALL, LIKENESS)
+    found = pose_hypotheses(given, spoiled(given[LOST]), LOST, ALL, LIKENESS, LostNumbers())
     assert nearest_deg(found, TRUTH[LOST]) < 5
 
 
@@ -81,12 +82,12 @@ def test_cameras_that_are_not_trusted_are_not_asked():
     poses[strayed] = turned([0, 0, 1.234]) @ poses[strayed]
     trusted = ALL.copy()
     trusted[[LOST, strayed]] = False
-    found = pose_hypotheses(TRUTH, poses, LOST, trusted, LIKENESS)
+    found = pose_hypotheses(TRUTH, poses, LOST, trusted, LIKENESS, LostNumbers())
     assert np.abs(found - poses[strayed]).max(axis=(1, 2)).min() > 1e-3
 
 
 def test_all_are_rigid_motions_even_where_nobody_can_be_asked():
-    found = pose_hypotheses(TRUTH, TRUTH, LOST, np.zeros(VIEWS, bool), LIKENESS)
+    found = pose_hypotheses(TRUTH, TRUTH, LOST, np.zeros(VIEWS, bool), LIKENESS, LostNumbers())
     rotations = found[:, :3, :3]
     np.testing.assert_allclose(
         rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (len(found), 1, 1)), atol=1e-12

@@ -7,7 +7,7 @@ import pytest
 
 from biresnerf.options.presets import PRESETS
 from biresnerf.options.refine_options import RefineOptions
-from biresnerf.refinement.optimise.schedule import FREEZE_SHARE, LENS_START, Schedule, smooth_ramp
+from biresnerf.refinement.optimise.schedule import Schedule, smooth_ramp
 
 SMALL_JUMP = 0.15  # of the largest value; the shortest ramp takes 15 steps
 
@@ -46,7 +46,7 @@ def test_the_smooth_ramp_is_flat_at_both_ends_and_half_in_the_middle():
 
 
 def test_lenses_stand_still_until_poses_have_explained_what_they_can(schedule):
-    start = LENS_START * schedule.options.coarse_steps_min
+    start = schedule.numbers.lens_start * schedule.options.coarse_steps_min
     assert start > 1
     assert all(schedule.lens_rate(step, None) == 0.0 for step in range(int(start) + 1))
     assert schedule.lens_rate(int(1.5 * start), None) > 0.0
@@ -68,7 +68,7 @@ def test_everything_within_stage_1_changes_little_from_step_to_step(schedule):
 @pytest.mark.slow
 def test_everything_within_stage_2_changes_little_from_step_to_step_until_poses_freeze(schedule):
     switch = switch_of(schedule)
-    steps = range(switch, int(FREEZE_SHARE * schedule.steps) - 1)
+    steps = range(switch, int(schedule.numbers.freeze_share * schedule.steps) - 1)
     for values in (
         [schedule.pose_rate(t, switch) for t in steps],
         [schedule.field_rates(t, switch).networks for t in steps],

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from biresnerf.refinement.stages.stability import LEAST_CHECKS, StabilityDetector
+from biresnerf.refinement.numbers.optimise import SwitchNumbers
+from biresnerf.refinement.stages.stability import StabilityDetector
 
+LEAST_CHECKS = SwitchNumbers().least_checks
 PERIOD = 200
 STILL = 0.0
 

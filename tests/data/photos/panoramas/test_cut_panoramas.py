@@ -24,6 +24,7 @@ from biresnerf.data.model.refined_set import refined_set
 from biresnerf.data.photos.decode import decode
 from biresnerf.data.photos.masks import load_mask
 from biresnerf.data.photos.panoramas.cut_panoramas import called_panoramas, cut_panoramas
+from biresnerf.data.scene_kind import OPEN
 from biresnerf.data.seeding.seed_poses import seed_poses
 from biresnerf.data.synthetic.captures import TABLE_SCENE, table_textures, write_panoramas
 from biresnerf.data.synthetic.scene import render_shapes
@@ -263,8 +264,8 @@ def test_control_points_marked_in_panoramas_are_seen_in_their_views(made, tmp_pa
 
 def test_a_forecast_counts_the_views(made, tmp_path):
     whole, options = read_dataset(made), RefineOptions(preset="fast").resolved("cpu")
-    foretold = workload(whole, options, unbounded=True, adjusts=True)
-    views = workload(cut(whole, tmp_path), options, unbounded=True, adjusts=True)
+    foretold = workload(whole, options, kind=OPEN, adjusts=True)
+    views = workload(cut(whole, tmp_path), options, kind=OPEN, adjusts=True)
     assert foretold == views
 
 

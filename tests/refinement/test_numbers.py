@@ -1,0 +1,153 @@
+"""The numbers that decide what a run does: all are explained and read, and a run heeds what the method has for them."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from biresnerf.field.radiance_field import Merging
+from biresnerf.judging.compare import Rule
+from biresnerf.refinement.lost.lost_cameras import LostCameraRepair
+from biresnerf.refinement.optimise.method_changes import changed, differences
+from biresnerf.refinement.optimise.methods import BIRESNERF
+from tests.refinement.tiny_scene import (
+    TinyRun,
+    given_scene,
+    tiny_optimiser,
+    tiny_options,
+    tiny_recipe,
+    tiny_set,
+)
+
+ROOT = Path(__file__).resolve().parents[2]
+READERS = [ROOT / "biresnerf/data/workload.py", *(ROOT / "biresnerf/refinement").rglob("*.py")]
+
+
+def rooms(holder: Any = BIRESNERF) -> Iterator[type]:
+    """Classes of numbers that the method holds, at any depth."""
+    for field in fields(holder):
+        value = getattr(holder, field.name)
+        if is_dataclass(value) and not isinstance(value, type | Merging | Rule):
+            yield type(value)
+            yield from rooms(value)
+
+
+ROOMS = sorted(set(rooms()), key=lambda room: room.__name__)
+
+
+def unexplained(room: type) -> list[str]:
+    """Fields without a comment beside or right above them."""
+    source = inspect.getsource(room)
+    lines = source.splitlines()
+    declared = [node for node in ast.parse(source).body[0].body if isinstance(node, ast.AnnAssign)]
+    return [
+        node.target.id
+        for node in declared
+        if not any("# " in line for line in lines[node.lineno - 1 : node.end_lineno])
+        and not lines[node.lineno - 2].strip().startswith("# ")
+    ]
+
+
+@pytest.mark.parametrize("room", ROOMS, ids=lambda room: room.__name__)
+def test_every_number_says_its_unit_and_reason(room):
+    assert room.__dataclass_params__.frozen
+    assert unexplained(room) == []
+
+
+def test_every_number_is_read_where_runs_are_made():
+    read = {
+        node.attr
+        for path in READERS
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load)
+    }
+    declared = {field.name for room in ROOMS for field in fields(room)}
+    assert len(declared) > 30
+    assert declared - read == set()
+
+
+def test_a_run_names_the_numbers_that_it_changed_and_no_others():
+    method = changed(BIRESNERF, {"course.freeze_share": 0.5, "kinds.open.facing_forward.least": 0.2})
+    assert differences(tiny_recipe(method)) == {
+        "course.freeze_share": "0.5",
+        "kinds.open.facing_forward.least": "0.2",
+    }
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory):
+    return tiny_set(tmp_path_factory.mktemp("tiny"))
+
+
+def optimiser(tiny, changes, *, unbounded=False):
+    """The tiny scene's at its first step, by our method with other numbers; open where it has no background."""
+    dataset, images = tiny
+    if unbounded:
+        images = replace(images, background=None, alpha=None)
+    return tiny_optimiser(dataset, images, tiny_options(), method=changed(BIRESNERF, changes))
+
+
+def test_steps_follow_the_methods_schedule(tiny):
+    ours, early = optimiser(tiny, {}), optimiser(tiny, {"course.freeze_share": 0.25})
+    assert early.schedule.pose_rate(9, None) == ours.schedule.pose_rate(9, None) > 0
+    assert early.schedule.pose_rate(10, None) == 0 < ours.schedule.pose_rate(10, None)
+
+
+def test_only_open_scenes_have_the_numbers_of_open_scenes(tiny):
+    change = {"kinds.open.samples": 6}
+    for unbounded, times in ((True, 3), (False, 1)):
+        before, after = (optimiser(tiny, each, unbounded=unbounded) for each in ({}, change))
+        assert after.schedule.samples(0, None) == times * before.schedule.samples(0, None)
+
+
+def test_doubted_cameras_weigh_as_much_as_the_method_says(tiny):
+    found = optimiser(tiny, {"errors.doubted_weight": 0.3}).camera_errors
+    found.doubt((torch.arange(7) == 2).numpy())
+    assert found.weights.tolist() == pytest.approx([1, 1, 0.3, 1, 1, 1, 1])
+
+
+def test_the_switch_waits_for_as_many_checks_as_the_method_says(tiny, tmp_path):
+    steps = []
+    for confirmations in (0, 10**6):
+        run = TinyRun(optimiser(tiny, {"switch.confirmations": confirmations}), given_scene(*tiny), tmp_path)
+        run.stages.run_stage_1()
+        steps.append(run.optimiser.switch)
+    assert steps == [10, 20]  # the least and the greatest length of stage 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "unbounded", "first"),
+    [
+        ({}, False, 5),
+        ({}, True, 10),
+        ({"kinds.bounded.repairs": (0.8,)}, False, 8),
+        ({"kinds.open.repairs": (0.3,)}, True, 3),
+    ],
+)
+def test_lost_cameras_are_looked_for_when_the_method_says(tiny, changes, unbounded, first):
+    run = optimiser(tiny, changes, unbounded=unbounded)
+    repair = LostCameraRepair(run)
+    due = []
+    for run.step_index in range(12):
+        due.append(repair.due())
+    assert due.index(True) == first  # the least length of stage 1 is 10
+
+
+def test_a_repair_costs_no_more_than_the_method_says(tiny):
+    spent = []
+    for share in (0.0, 0.5):
+        run = optimiser(
+            tiny, {"lost.event_share": share, "lost.run_share": share, "lost.rounds": ((1, 8, 2),)}
+        )
+        run.camera_errors.doubt((torch.arange(7) == 2).numpy())
+        repair = LostCameraRepair(run)
+        repair.run()
+        spent.append(repair.state().spent)
+    assert spent[1] > 2 * spent[0]  # the first is of the scores of cameras that are not lost
