@@ -251,7 +251,7 @@ def _seed(dataset: Dataset, setup: _Setup) -> tuple[Scene, RunOrigin]:
         folder.path.mkdir(parents=True, exist_ok=True)
         tracks = Tracks.load(folder.path / TRACKS, dataset.names)
         start = find_start(seeding.candidates, seeding.dataset, images, tracks, recipe, monitor)
-    held_out = held_out_views(len(dataset), options.holdout, start.reliable)
+    held_out = held_out_views(len(dataset), options.holdout, recipe.method.views, start.reliable)
     return Scene(seeding.dataset, images, start, held_out, tracks), origin
 
 

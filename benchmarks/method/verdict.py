@@ -21,7 +21,7 @@ from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import pose_error
 from biresnerf.geometry.similarity import align_robust
 from biresnerf.options.refine_options import RefineOptions
-from biresnerf.refinement.optimise.methods import Recipe
+from biresnerf.refinement.optimise.methods import Recipe, find_method
 from biresnerf.refinement.views.compare_rigs import Rig, compare_on_unseen_views
 from biresnerf.refinement.views.held_out_views import held_out_views
 from biresnerf.refinement.views.motion import moved_px
@@ -64,7 +64,7 @@ def main() -> None:
             preset="fast", device="cpu", seed=seed, max_image_size=asked.size, trial_steps=asked.steps
         ).resolved("cpu")
         found = compare_on_unseen_views(
-            (before, after), images, held_out_views(len(dataset), "auto"),
+            (before, after), images, held_out_views(len(dataset), "auto", find_method("biresnerf").views),
             Recipe.of(options, torch.device("cpu"), use_threads(0)), lambda: False,
         )  # fmt: skip
         if found is None:

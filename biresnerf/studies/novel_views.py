@@ -19,7 +19,7 @@ from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.similarity import align_robust
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.parameters.pose_parameters import PoseParameters
-from biresnerf.refinement.views.evaluation import FIT_RATE, FIT_STEPS, fit_rays, render_view
+from biresnerf.refinement.views.evaluation import fit_rays, render_view
 from biresnerf.refinement.views.floaters import unshared_opacity
 
 # torchvision's name of the file. The package would download it, which a measurement must not do.
@@ -77,13 +77,14 @@ def _fitted(
     pixels = torch.nonzero(torch.ones(photo.shape[:2]) if counts is None else counts)
     rays, renderer = fit_rays(optimiser.method, optimiser.rays), optimiser.renderer
     which = torch.full((rays,), index, device=device)
-    for step in range(FIT_STEPS):
+    steps, rate = optimiser.method.views.fit_steps, optimiser.method.views.fit_rate
+    for step in range(steps):
         y, x = pixels[torch.randint(len(pixels), (rays,), generator=optimiser.generator)].T
         xy = torch.stack([x, y], 1).to(device) + 0.5
         cast = renderer.cast(pose.matrices().expand(rays, 3, 4), which, xy, intrinsics)
         rendering = renderer.render(*cast, jitter=True)
         optimiser.method.loss(rendering.colour, photo[y, x].to(device)).mean().backward()
-        pose.step(FIT_RATE * 0.1 ** (step / FIT_STEPS))
+        pose.step(rate * 0.1 ** (step / steps))
     return pose.matrices().detach()[0]
 
 

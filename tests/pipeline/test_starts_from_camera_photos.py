@@ -19,7 +19,9 @@ from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.pose_error import PoseError, pose_error
 from biresnerf.pipeline import refine_poses
-from biresnerf.refinement.start import choose_start, turntable
+from biresnerf.refinement.optimise.method_changes import changed
+from biresnerf.refinement.optimise.methods import BIRESNERF
+from biresnerf.refinement.start import choose_start
 from biresnerf.report import Report
 from tests.data.scenes import plain_features, textured_arc
 from tests.refinement.tiny_scene import tiny_run
@@ -53,9 +55,12 @@ def photos(folder: Path, maker: str, noise: float | None = None, missing: tuple[
     return truth
 
 
-def refined(folder: Path, truth: np.ndarray, start: str, **options) -> tuple[Report, PoseError]:
+def refined(
+    folder: Path, truth: np.ndarray, start: str, numbers: dict | None = None, **options
+) -> tuple[Report, PoseError]:
+    asked, method = tiny_run(start=start, verdict=False, **options), changed(BIRESNERF, numbers or {})
     with plain_features():
-        report = refine_poses(folder / "set", folder / "out", tiny_run(start=start, verdict=False, **options))
+        report = refine_poses(folder / "set", folder / "out", asked, method=method)
     found = np.tile(np.eye(4), (len(truth), 1, 1))
     found[:, :3] = [image.world_from_cam for image in read_poses_json(folder / "out/poses.json").images]
     return report, pose_error(found, truth)
@@ -64,9 +69,8 @@ def refined(folder: Path, truth: np.ndarray, start: str, **options) -> tuple[Rep
 @needs_colmap
 def test_auto_brings_the_poses_of_a_phone_near_the_truth(tmp_path, monkeypatch):
     monkeypatch.setattr(choose_start, "TRIAL_STEPS", 80)
-    monkeypatch.setattr(choose_start, "MOVING_STEPS", 120)
     truth = photos(tmp_path / "set", "android", noise=0.1)
-    report, error = refined(tmp_path, truth, "auto")
+    report, error = refined(tmp_path, truth, "auto", {"start.moving_steps": 120})
     assert {image.pose_source for image in report.images} == {"matches-incremental"}
     assert error.aligned.rotation_deg.median < 2  # of 12
 
@@ -93,12 +97,11 @@ def test_without_features_photos_of_a_phone_held_both_ways_are_put_between_their
     assert error.own_frame.rotation_deg.max < 9  # of the 90 by which its neighbours are turned
 
 
-def test_a_turning_scene_before_a_reflex_camera_is_put_on_a_ring(tmp_path, monkeypatch):
-    monkeypatch.setattr(turntable, "ELEVATIONS_DEG", (0.0, 30.0, 60.0))
-    monkeypatch.setattr(turntable, "TRY_STEPS", 75)
+def test_a_turning_scene_before_a_reflex_camera_is_put_on_a_ring(tmp_path):
+    shorter = {"start.elevations_deg": (0.0, 30.0, 60.0), "start.ring_steps": 75}
     truth = turntable_cameras(24, uneven=0.2, seed=1)
     pictures = (render_synthetic(pose, 32, 3)[0] for pose in truth)
     write_blender_set(tmp_path / "set", truth, pictures, "dome", MAKERS["reflex"])
-    report, error = refined(tmp_path, truth, "turntable", max_image_size=32)
+    report, error = refined(tmp_path, truth, "turntable", shorter, max_image_size=32)
     assert {image.pose_source for image in report.images} == {"turntable"}
     assert error.aligned.centre_percent.mean < 10  # so few steps do not tell how high the camera stands

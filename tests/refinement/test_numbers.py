@@ -12,22 +12,30 @@ from typing import Any
 import pytest
 import torch
 
+from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.field.radiance_field import Merging
+from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.judging.compare import Rule
 from biresnerf.refinement.lost.lost_cameras import LostCameraRepair
 from biresnerf.refinement.optimise.method_changes import changed, differences
 from biresnerf.refinement.optimise.methods import BIRESNERF
+from biresnerf.refinement.start.first_step import stage_lengths
+from biresnerf.refinement.verdict.judgement import judge_poses
+from biresnerf.refinement.views.evaluation import fit_held_out_poses
+from biresnerf.studies.scenes import with_poses
 from tests.refinement.tiny_scene import (
     TinyRun,
     given_scene,
     tiny_optimiser,
     tiny_options,
     tiny_recipe,
+    tiny_run,
     tiny_set,
 )
 
 ROOT = Path(__file__).resolve().parents[2]
-READERS = [ROOT / "biresnerf/data/workload.py", *(ROOT / "biresnerf/refinement").rglob("*.py")]
+DATA = [ROOT / "biresnerf/data" / name for name in ("scene_kind.py", "workload.py")]
+READERS = [*DATA, *(ROOT / "biresnerf/refinement").rglob("*.py")]
 
 
 def rooms(holder: Any = BIRESNERF) -> Iterator[type]:
@@ -91,7 +99,7 @@ def optimiser(tiny, changes, *, unbounded=False):
     dataset, images = tiny
     if unbounded:
         images = replace(images, background=None, alpha=None)
-    return tiny_optimiser(dataset, images, tiny_options(), method=changed(BIRESNERF, changes))
+    return tiny_optimiser(dataset, images, tiny_options(), [3], changed(BIRESNERF, changes))
 
 
 def test_steps_follow_the_methods_schedule(tiny):
@@ -151,3 +159,33 @@ def test_a_repair_costs_no_more_than_the_method_says(tiny):
         repair.run()
         spent.append(repair.state().spent)
     assert spent[1] > 2 * spent[0]  # the first is of the scores of cameras that are not lost
+
+
+def test_stage_1_shrinks_to_the_methods_share_where_matches_placed_the_cameras(tiny):
+    matched = InitialPoses(tiny[0].world_from_cam, "matches-incremental", ("matches-incremental",) * 7)
+    asked = tiny_run().model_copy(update={"coarse_steps_max": None})
+    lengths = [
+        stage_lengths(matched, asked, tiny_recipe(changed(BIRESNERF, {"start.matched_coarse_share": share})))
+        for share in (0.6, 0.9)
+    ]
+    assert [recipe.options.coarse_steps_max for recipe in lengths] == [12, 18]  # of 20
+
+
+def test_held_out_poses_are_fitted_for_as_many_steps_as_the_method_says(tiny):
+    moved = []
+    for steps in (0, 3):
+        run = optimiser(tiny, {"views.fit_steps": steps})
+        before = run.poses.poses()
+        fit_held_out_poses(run, [3])
+        moved.append(torch.nonzero((run.poses.poses() != before).any((1, 2))).ravel().tolist())
+    assert moved == [[], [3]]
+
+
+def test_the_verdict_takes_for_unchanged_what_the_method_cannot_measure(tiny, tmp_path):
+    dataset, images = tiny
+    given = given_scene(dataset, images, given=perturb_poses(dataset.world_from_cam, 0.05, seed=1))
+    noisy = replace(given, dataset=with_poses(dataset, given.start.world_from_cam))
+    verdict = judge_poses(*TinyRun(optimiser(tiny, {"verdict.measurable_px": 50.0}), noisy, tmp_path).parts)
+    assert verdict.verdict.moved_px > 2 * BIRESNERF.verdict.measurable_px
+    assert verdict.verdict.verdict == "unchanged"
+    assert "50 px" in verdict.verdict.why[0]

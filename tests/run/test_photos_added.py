@@ -12,6 +12,8 @@ import biresnerf
 from biresnerf.errors import InputError
 from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.geometry.similarity import align_by_spread
+from biresnerf.refinement.optimise.method_changes import changed
+from biresnerf.refinement.optimise.methods import BIRESNERF
 from biresnerf.refinement.start import choose_start
 from tests.data.scenes import plain_features, textured_arc
 
@@ -21,7 +23,7 @@ pytest.importorskip("pycolmap", reason="needs pycolmap (pip install 'biresnerf[c
 OLD, ALL = 8, 10
 OPTIONS = {
     "preset": "fast", "device": "cpu", "steps": 80, "max_image_size": 24, "samples_per_step": 1024, "orbit_frames": 0,
-    "verdict": False,
+    "verdict": False, "method": changed(BIRESNERF, {"start.moving_steps": 80}),
     "pose_resolution_max": 16, "reconstruction_levels": 1, "reconstruction_resolution_max": 128, "table_size_log2": 10,
 }  # fmt: skip
 
@@ -31,7 +33,6 @@ def short_trials():
     """Trials of the start are long enough for photos of so few pixels."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(choose_start, "TRIAL_STEPS", 40)
-        patch.setattr(choose_start, "MOVING_STEPS", 80)
         yield
 
 

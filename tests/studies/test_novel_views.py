@@ -8,10 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.similarity import Similarity
-from biresnerf.refinement.views import evaluation
+from biresnerf.refinement.optimise.method_changes import changed
 from biresnerf.refinement.views.evaluation import render_view
 from biresnerf.refinement.views.image_metrics import psnr
-from biresnerf.studies import novel_views
 from biresnerf.studies.novel_views import render_test_views
 from biresnerf.studies.scenes import with_poses
 from tests.refinement.tiny_scene import tiny_optimiser, tiny_options, tiny_set
@@ -32,8 +31,8 @@ def trained(tmp_path_factory):
 
 
 def test_a_view_at_a_training_cameras_true_pose_is_what_that_camera_sees(trained, monkeypatch):
-    monkeypatch.setattr(novel_views, "FIT_STEPS", 0)
     optimiser, dataset = trained
+    monkeypatch.setattr(optimiser, "method", changed(optimiser.method, {"views.fit_steps": 0}))
     expected = render_view(optimiser.renderer, optimiser.poses.matrices().detach()[2], 2).colour
     pairs = list(render_test_views(optimiser, dataset, dataset.world_from_cam))
     np.testing.assert_allclose(pairs[2].render.numpy(), expected, atol=1e-3)
@@ -48,8 +47,9 @@ def test_fitting_makes_up_for_a_frame_that_is_a_little_off(trained, monkeypatch)
         pairs = render_test_views(optimiser, off, dataset.world_from_cam)
         return float(np.mean([psnr(pair.render, pair.photo) for pair in pairs]))
 
-    monkeypatch.setattr(evaluation, "FIT_RAYS", 256)
-    monkeypatch.setattr(novel_views, "FIT_STEPS", 0)
-    unfitted = decibels()
-    monkeypatch.setattr(novel_views, "FIT_STEPS", 40)
-    assert decibels() > unfitted + 0.3
+    found = []
+    for steps in (0, 40):
+        quick = {"views.fit_rays": 256, "views.fit_steps": steps}
+        monkeypatch.setattr(optimiser, "method", changed(optimiser.method, quick))
+        found.append(decibels())
+    assert found[1] > found[0] + 0.3

@@ -42,7 +42,7 @@ def _counted(values: np.ndarray, images: ImageSet, index: int) -> np.ndarray:
     return values.reshape(-1, *values.shape[2:]) if counts is None else values[counts]
 
 
-def outliers(errors: Tensor, held_out: Tensor, numbers: ErrorNumbers = ErrorNumbers()) -> Tensor:
+def outliers(errors: Tensor, held_out: Tensor, numbers: ErrorNumbers) -> Tensor:
     """Mask [n] of the errors [n] that stand out.
 
     Held-out views, which the field never saw, are measured by their own median where there are enough of them;

@@ -18,6 +18,7 @@ from biresnerf.field.grid_levels import GridLevels, grid_levels
 from biresnerf.field.radiance_field import FieldShape, Merging, RadianceField
 from biresnerf.options.presets import MethodName
 from biresnerf.options.refine_options import ResolvedOptions
+from biresnerf.refinement.numbers.choosing import StartNumbers, VerdictNumbers, ViewNumbers
 from biresnerf.refinement.numbers.lost import LostNumbers
 from biresnerf.refinement.numbers.optimise import ErrorNumbers, ScheduleNumbers, SwitchNumbers
 from biresnerf.refinement.optimise.schedule import Schedule
@@ -58,6 +59,7 @@ class Method:
         by_detail: share of the rays that are drawn in proportion to the photos' detail, see `PixelChances`.
         course, errors, switch, kinds, lost: numbers of the schedule, of cameras that stand out, of the switch to
             stage 2, of open scenes, and of lost cameras.
+        start, views, verdict: numbers of the start, of unseen views, and of the verdict.
     """
 
     build_field: BuildField
@@ -85,6 +87,9 @@ class Method:
     switch: SwitchNumbers = SwitchNumbers()
     kinds: SceneKinds = SceneKinds()
     lost: LostNumbers = LostNumbers()
+    start: StartNumbers = StartNumbers()
+    views: ViewNumbers = ViewNumbers()
+    verdict: VerdictNumbers = VerdictNumbers()
 
     def scheduled(self, options: ResolvedOptions, frame: SceneFrame) -> Schedule:
         """The schedule of a run in a scene."""

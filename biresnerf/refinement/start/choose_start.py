@@ -19,6 +19,7 @@ from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.data.workload import LOOKS, TRIAL_STEPS
 from biresnerf.judging.compare import CLEAR_TRIAL, TRIAL, is_better
 from biresnerf.progress import Monitor, Progress
+from biresnerf.refinement.numbers.choosing import StartNumbers
 from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.start.forward_facing import find_forward_facing
 from biresnerf.refinement.start.matches_explained import matches_explained
@@ -27,11 +28,6 @@ from biresnerf.refinement.views.pose_trials import PoseTrials, Trial, trial_view
 from biresnerf.report import TrialReport
 
 logger = logging.getLogger(__name__)
-
-# Right poses explain so many of the matches that no mapping was shown, wrong ones fewer: 0.95 to 0.98 on five sets,
-# and 0.56 to 0.59 for coffee's wrong models (docs/input.md).
-EXPLAINS = 0.9
-MOVING_STEPS = 400
 
 
 def find_start(
@@ -92,18 +88,18 @@ def choose_start(
     if len(placed) < len(images):
         images = images.of(placed)
     rigs = [candidate.world_from_cam[placed] for candidate in candidates]
-    unseen = trial_views(len(images))
+    unseen = trial_views(len(images), recipe.method.views)
 
     def begun(steps: int, *, moving: bool) -> list[Trial]:
         trials = PoseTrials(images, unseen, rigs, recipe, steps, should_stop)
         return [trials.begin(rig, moving=moving) for rig in rigs]
 
-    work = 0.0
-    for steps, moving in ((TRIAL_STEPS, False), (MOVING_STEPS, True)):
+    work, numbers = 0.0, recipe.method.start
+    for steps, moving in ((TRIAL_STEPS, False), (numbers.moving_steps, True)):
         running = begun(steps, moving=moving)
-        scores = _scores_when_decided(running, explained)
+        scores = _scores_when_decided(running, explained, numbers)
         work += sum(trial.work for trial in running)
-        if _decided(scores, explained):
+        if _decided(scores, explained, numbers):
             break
     did(work)
     best = int(np.argmax(scores))
@@ -124,23 +120,25 @@ def choose_start(
     return replace(chosen, trials=trials, matched_poses=likeliest)
 
 
-def _scores_when_decided(running: Sequence[Trial], explained: Sequence[float]) -> list[float]:
+def _scores_when_decided(
+    running: Sequence[Trial], explained: Sequence[float], numbers: StartNumbers
+) -> list[float]:
     """Mean PSNR of each at the first of the `LOOKS` that decides, else at the end."""
     for look in LOOKS:
         for trial in running:
             trial.train(look)
         scores = [float(trial.scores().psnr.mean()) for trial in running]
-        if _decided(scores, explained):
+        if _decided(scores, explained, numbers):
             break
     return scores
 
 
-def _decided(scores: Sequence[float], explained: Sequence[float]) -> bool:
+def _decided(scores: Sequence[float], explained: Sequence[float], numbers: StartNumbers) -> bool:
     """Whether the best is clearly so, or photos prefer it to all that leave matches unexplained, and it does not."""
     first, second = sorted(scores, reverse=True)[:2]
     if is_better(first - second, CLEAR_TRIAL):
         return True
-    if explained[int(np.argmax(scores))] < EXPLAINS:
+    if explained[int(np.argmax(scores))] < numbers.explains:
         return False
-    others = [score for score, share in zip(scores, explained, strict=True) if share < EXPLAINS]
+    others = [score for score, share in zip(scores, explained, strict=True) if share < numbers.explains]
     return is_better(first - max(others, default=-np.inf), TRIAL)

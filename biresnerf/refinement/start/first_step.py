@@ -18,9 +18,6 @@ from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.scene.scene_depth import matched_depth
 from biresnerf.refinement.scene.scene_frame import scene_frame
 
-# Where matches placed most cameras, stage 1 has only to form the field: its lengths shrink to this share.
-MATCHED_COARSE_SHARE = 2 / 3
-
 
 def first_step(scene: Scene, recipe: Recipe) -> JointOptimiser:
     """The optimisation at its first step, in the unit frame of the initial poses."""
@@ -60,9 +57,8 @@ def stage_lengths(start: InitialPoses, asked: RefineOptions, recipe: Recipe) -> 
         return recipe
     resolved = recipe.options
     names = [n for n in ("coarse_steps_min", "coarse_steps_max") if getattr(asked, n) is None]
-    shorter = {
-        name: max(FEWEST_OF_STAGE, round(MATCHED_COARSE_SHARE * getattr(resolved, name))) for name in names
-    }
+    share = recipe.method.start.matched_coarse_share
+    shorter = {name: max(FEWEST_OF_STAGE, round(share * getattr(resolved, name))) for name in names}
     if "coarse_steps_max" in shorter:
         least = shorter.get("coarse_steps_min", resolved.coarse_steps_min)
         shorter["coarse_steps_max"] = max(least, shorter["coarse_steps_max"])

@@ -25,8 +25,6 @@ from biresnerf.refinement.views.pose_trials import trial_views
 
 logger = logging.getLogger(__name__)
 
-FIRST_STEPS, SECOND_STEPS = 800, 800
-SAMPLES = 1 << 14  # a step
 MIRROR = np.diag([1.0, 1.0, -1.0])
 
 
@@ -46,11 +44,11 @@ def find_forward_facing(
         Interrupted: ``should_stop`` returned true.
     """
     frame = scene_frame(np.tile(np.eye(4), (len(images), 1, 1)), images)
-    unseen = trial_views(len(images))
+    numbers, unseen = recipe.method.start, trial_views(len(images), recipe.method.views)
 
     def run(world_from_cam: NDArray[np.float64], steps: int) -> tuple[NDArray[np.float64], float]:
         """Poses after stage 1 alone, and mean PSNR of views that move their own pose, but do not train the field."""
-        short = recipe.apart(steps, (steps // 4, steps), SAMPLES)
+        short = recipe.apart(steps, (steps // 4, steps), numbers.facing_samples)
         poses = frame.unit_from_world.apply_to_poses(world_from_cam)
         optimiser = JointOptimiser(images, frame, poses, short, unseen)
         for _ in range(steps):
@@ -60,8 +58,8 @@ def find_forward_facing(
         psnr = float(np.mean([score.psnr for score in score_views(optimiser.renderer, images, unseen)]))
         return frame.unit_from_world.inverse().apply_to_poses(optimiser.poses.poses().numpy()), psnr
 
-    first, _ = run(world_from_cam, FIRST_STEPS)
-    tries = [run(rig, SECOND_STEPS) for rig in (first, mirrored(first))]
+    first, _ = run(world_from_cam, numbers.facing_first_steps)
+    tries = [run(rig, numbers.facing_second_steps) for rig in (first, mirrored(first))]
     logger.info("forward-facing: %.2f dB, mirrored in depth %.2f dB", tries[0][1], tries[1][1])
     best, psnr = max(tries, key=lambda found: found[1])
     bound = resemblance_psnr(images, unseen)

@@ -36,12 +36,6 @@ from biresnerf.report import TrialReport
 
 logger = logging.getLogger(__name__)
 
-ELEVATIONS_DEG = (-30.0, 0.0, 30.0, 60.0)
-NEAR_DEG = 8.0  # from the elevation found among those, up and down
-TRY_STEPS = 150
-SAMPLES = 1 << 12  # a step
-UNSEEN_RAYS = 1 << 13  # pixels of all unseen photos that are rendered after each run
-
 
 @dataclass(frozen=True, eq=False)
 class Tried:
@@ -66,11 +60,11 @@ class RingTrials:
         should_stop: Callable[[], bool],
     ) -> None:
         self._run = torch.from_numpy(order.run)
-        self.images, self.unseen = images, trial_views(len(images))
+        self.images, self.unseen = images, trial_views(len(images), recipe.method.views)
         self._recipe, self._should_stop = recipe, should_stop
         self._sampler = PhotoSampler(images, self.unseen, recipe.device, recipe.method.by_detail)
         pixels = int(sum(images.widths[v] * images.heights[v] for v in self.unseen))
-        self._stride = max(1, math.ceil(math.sqrt(pixels / UNSEEN_RAYS)))
+        self._stride = max(1, math.ceil(math.sqrt(pixels / recipe.method.start.ring_unseen_rays)))
         even = torch.arange(len(images)) * (2 * torch.pi / len(images))
         self.frame = scene_frame(Ring.level(even).matrices(), images)
 
@@ -80,13 +74,15 @@ class RingTrials:
         Raises:
             Interrupted: ``should_stop`` returned true.
         """
-        short = self._recipe.apart(TRY_STEPS, (TRY_STEPS // 4, 2 * TRY_STEPS), SAMPLES)
+        numbers = self._recipe.method.start
+        steps = numbers.ring_steps
+        short = self._recipe.apart(steps, (steps // 4, 2 * steps), numbers.ring_samples)
         poses = self.frame.unit_from_world.apply_to_poses(ring.matrices())
         moving = RingParameters(ring, self.frame.distance, self._run, self._recipe.device)
         optimiser = JointOptimiser(
             self.images, self.frame, poses, short, self.unseen, sampler=self._sampler, poses=moving
         )
-        for _ in range(TRY_STEPS):
+        for _ in range(steps):
             if self._should_stop():
                 raise Interrupted("stopped while rings of cameras were tried")
             optimiser.step()
@@ -115,7 +111,7 @@ def start_on_turntable(
     order = find_ring(images, order_on_ring(even.world_from_cam))
     trials = RingTrials(images, order, recipe, should_stop)
     ways = []
-    for rings in rings_to_try(images, order):
+    for rings in rings_to_try(images, order, recipe.method.start.elevations_deg):
         tried = [trials.run(ring) for ring in rings]
         best = max(tried, key=lambda one: one.psnr)
         ways.append(trials.run(at_elevation(best.ring, likeliest_elevation(tried))))
@@ -123,7 +119,7 @@ def start_on_turntable(
     for one in ways:
         elevation = math.degrees(float(one.ring.elevation))
         logger.info("turntable: %.2f dB at an elevation of %.1f degrees", one.psnr, elevation)
-    ring, near = ways[0].ring, math.radians(NEAR_DEG)
+    ring, near = ways[0].ring, math.radians(recipe.method.start.near_deg)
     # The one between starts where the others do, with azimuths that have moved already.
     heights = [float(ring.elevation) + shift for shift in (-near, 0.0, near)]
     closer = [trials.run(at_elevation(ring, height)) for height in heights]
@@ -156,7 +152,7 @@ def at_elevation(ring: Ring, elevation: float) -> Ring:
     return replace(ring, elevation=torch.tensor(elevation))
 
 
-def rings_to_try(images: ImageSet, order: RingOrder) -> list[list[Ring]]:
+def rings_to_try(images: ImageSet, order: RingOrder, elevations_deg: Sequence[float]) -> list[list[Ring]]:
     """Rings at a few elevations, a row for each way that they turn."""
     quarter, place = axis_in_photos(images, order)
     camera = images.cameras[order.order[0]].full()
@@ -168,7 +164,7 @@ def rings_to_try(images: ImageSet, order: RingOrder) -> list[list[Ring]]:
     return [
         [
             Ring(way * turn, torch.tensor(math.radians(e)), torch.tensor(pan), torch.tensor(0.0), quarters)
-            for e in ELEVATIONS_DEG
+            for e in elevations_deg
         ]
         for way in (1, -1)
     ]

@@ -8,16 +8,12 @@ from numpy.typing import NDArray
 
 from biresnerf.arrays import Array
 from biresnerf.data.photos.images import ImageSet
+from biresnerf.refinement.numbers.choosing import VerdictNumbers
 from biresnerf.refinement.optimise.photo_sampler import PhotoSampler
 from biresnerf.refinement.optimise.renderer import Renderer
 
 NEIGHBOURS = 6  # photos from the nearest places, which show about the same
-BLURRED_BELOW = 0.3  # of the neighbours' sharpness: a blur of about one px of the working size
 GAIN_RAYS = 256  # of each photo
-EXPOSURE_OFF = 0.2  # log of the gain against the median photo's: a fifth, or a quarter of a stop
-DEVIATIONS = 5.0  # robust standard deviations that an outlier must stand out by as well
-# A pose moved far by more than so many medians, and at least so many degrees or so much of the cameras' distance.
-FAR_TIMES, FAR_DEG, FAR_SHARE = 4.0, 1.0, 0.02
 MAD_TO_DEVIATION = 1.4826
 DARKEST = 0.02  # mean colour below which a photo has no gain
 
@@ -69,12 +65,12 @@ def gains(renderer: Renderer, sampler: PhotoSampler, draws: torch.Generator) -> 
     return np.where(dark, np.nan, shown / np.maximum(rendered, 1e-12))
 
 
-def blurred(relative: Array) -> NDArray[np.bool_]:
+def blurred(relative: Array, numbers: VerdictNumbers) -> NDArray[np.bool_]:
     """Which photos [n] are blurred, by their `sharpness`."""
-    return relative < BLURRED_BELOW
+    return relative < numbers.blurred_below
 
 
-def exposure_off(gain: Array) -> NDArray[np.bool_]:
+def exposure_off(gain: Array, numbers: VerdictNumbers) -> NDArray[np.bool_]:
     """Which photos [n] are exposed otherwise than the rest, by their `gains`."""
     logs = np.log(gain)
     known = np.isfinite(logs)
@@ -82,11 +78,13 @@ def exposure_off(gain: Array) -> NDArray[np.bool_]:
         return np.zeros(len(gain), dtype=np.bool_)
     apart = np.abs(logs - np.median(logs[known]))
     deviation = MAD_TO_DEVIATION * float(np.median(apart[known]))
-    return known & (apart > max(EXPOSURE_OFF, DEVIATIONS * deviation))
+    return known & (apart > max(numbers.exposure_off, numbers.exposure_deviations * deviation))
 
 
-def moved_far(turned_deg: Array, shifted: Array, distance: float) -> NDArray[np.bool_]:
+def moved_far(
+    turned_deg: Array, shifted: Array, distance: float, numbers: VerdictNumbers
+) -> NDArray[np.bool_]:
     """Which cameras [n] moved by far more than most; `distance` is that of the cameras from the scene."""
-    turn = turned_deg > max(FAR_DEG, FAR_TIMES * float(np.median(turned_deg)))
-    shift = shifted > max(FAR_SHARE * distance, FAR_TIMES * float(np.median(shifted)))
+    turn = turned_deg > max(numbers.moved_deg, numbers.moved_times * float(np.median(turned_deg)))
+    shift = shifted > max(numbers.moved_share * distance, numbers.moved_times * float(np.median(shifted)))
     return turn | shift

@@ -21,6 +21,7 @@ from biresnerf.refinement.finish.expected_errors import ExpectedErrors
 from biresnerf.refinement.finish.gather_evidence import measured_evidence
 from biresnerf.refinement.finish.outcome import Finish
 from biresnerf.refinement.lost.own_matches import contradicted
+from biresnerf.refinement.numbers.choosing import VerdictNumbers
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.methods import Method
 from biresnerf.refinement.parameters.joint_parameters import JointParameters
@@ -30,8 +31,6 @@ from biresnerf.refinement.start.refined_poses import RefinedPoses
 from biresnerf.refinement.verdict import image_flags
 from biresnerf.refinement.verdict.pose_evidence import compare_on_matches, errors_px, working_share
 from biresnerf.refinement.verdict.verdict import (
-    FAR_DEG,
-    MEASURABLE_PX,
     Findings,
     decide,
     failed_checks,
@@ -39,7 +38,6 @@ from biresnerf.refinement.verdict.verdict import (
     matches_are_better,
 )
 from biresnerf.refinement.views.compare_rigs import (
-    LONGER,
     BeforeAfter,
     Effort,
     HeldOutComparison,
@@ -47,7 +45,6 @@ from biresnerf.refinement.views.compare_rigs import (
     compare_placed,
     may_be_blur,
 )
-from biresnerf.refinement.views.held_out_views import ROUNDS_MOST
 from biresnerf.refinement.views.motion import moved_px
 from biresnerf.report import EpipolarEvidence, Finding, Verdict
 
@@ -101,10 +98,10 @@ def judge(scene: Scene, optimiser: JointOptimiser, run: RunState, finish: Finish
     return judgement
 
 
-def _rounds(run: RunState, times: int) -> int:
+def _rounds(run: RunState, times: int, most: int) -> int:
     """How many rounds of trainings of `times` the usual length there is time for."""
     each_s = times * run.monitor.forecast.seconds("judging")
-    return int(min(max(run.left_s / max(each_s, 1e-9), 0), ROUNDS_MOST))
+    return int(min(max(run.left_s / max(each_s, 1e-9), 0), most))
 
 
 def judge_poses(
@@ -116,27 +113,27 @@ def judge_poses(
     """
     report = partial(run.report_evaluation, message="comparing the refined poses with the input's")
     report(0.0)
-    joint = optimiser.joint
+    joint, numbers, most = optimiser.joint, optimiser.method.verdict, optimiser.method.views.rounds_most
     refined = RefinedPoses.now(scene.dataset, joint)
     lost = int(optimiser.camera_errors.lost.sum())
-    found = compare_without_training(scene, refined, lost)
+    found = compare_without_training(scene, refined, lost, numbers)
     # Only then it matters what the evidence determines: to know it, a matrix of all cameras is inverted.
     asked = matches_are_better(found.findings) and optimiser.method.uncertainty
     errors = _errors(refined, joint, finish) if asked else None
     told = replace(found.findings, determined=_determined(errors, finish))
     heldout: HeldOutComparison | None = None
     work = 0.0
-    if told.moved_px >= MEASURABLE_PX:
+    if told.moved_px >= numbers.measurable_px:
         effort = Effort(pictured=True, favoured=told.by_matches, moved_px=told.moved_px)
-        rounds = max(_rounds(run, 1), 1)
-        for each in (effort, replace(effort, times=LONGER, looks=(1.0,))):
+        rounds = max(_rounds(run, 1, most), 1)
+        for each in (effort, replace(effort, times=numbers.longer, looks=(1.0,))):
             heldout = compare_placed(
                 found.before, found.after, scene, optimiser.recipe, found.placed | (not told.grounded),
                 run.monitor.should_stop, report, replace(each, rounds_most=rounds),
             )  # fmt: skip
             work += heldout.work if heldout else 0.0
-            blur = each is effort and heldout is not None and may_be_blur(heldout.evidence, effort)
-            rounds = _rounds(run, LONGER) if blur else 0
+            blur = each is effort and heldout is not None and may_be_blur(heldout.evidence, effort, numbers)
+            rounds = _rounds(run, numbers.longer, most) if blur else 0
             if not rounds:
                 told = replace(told, may_be_blur=blur)
                 break
@@ -179,7 +176,9 @@ class Compared:
     findings: Findings
 
 
-def compare_without_training(scene: Scene, refined: RefinedPoses, lost: int) -> Compared:
+def compare_without_training(
+    scene: Scene, refined: RefinedPoses, lost: int, numbers: VerdictNumbers
+) -> Compared:
     """The input's poses and refined ones by motion and feature matches; `lost` cameras agree with no pose found."""
     dataset, images = scene.dataset, scene.images
     rows = range(len(dataset))
@@ -188,7 +187,7 @@ def compare_without_training(scene: Scene, refined: RefinedPoses, lost: int) -> 
     turned, shifted = motion(before.world_from_cam, after.world_from_cam)
     spread = rms_spread(before.world_from_cam[:, :3, 3])
     grounded = sum(frame.pose_source not in GUESSED for frame in dataset.frames) > len(dataset) / 2
-    failed = failed_checks(after.world_from_cam, lost)
+    failed = failed_checks(after.world_from_cam, lost, numbers)
     epipolar: EpipolarEvidence | None = None
     moved = 0.0
     placed = np.array([frame.pose_source not in GUESSES for frame in dataset.frames])
@@ -196,7 +195,12 @@ def compare_without_training(scene: Scene, refined: RefinedPoses, lost: int) -> 
         moved = moved_px(before, after, images)
         if scene.tracks is not None:
             epipolar = compare_on_matches(
-                before, after, scene.tracks, placed, started_from_matches=bool(scene.start.matched.any())
+                before,
+                after,
+                scene.tracks,
+                placed,
+                numbers.least_matched,
+                started_from_matches=bool(scene.start.matched.any()),
             )
     findings = Findings(
         failed=failed,
@@ -206,12 +210,13 @@ def compare_without_training(scene: Scene, refined: RefinedPoses, lost: int) -> 
         compared_with=_source_of_poses(dataset),
         grounded=grounded,
         working_share=working_share(before, images),
-        out_of_frame=frame_doubt(turned, shifted, spread) if grounded and not failed else "",
-        turned_far=bool(np.median(turned) > FAR_DEG),
+        out_of_frame=frame_doubt(turned, shifted, spread, numbers) if grounded and not failed else "",
+        turned_far=bool(np.median(turned) > numbers.far_deg),
         faults=tuple(map(str, dataset.faults)),
         offset=dataset.body_offset is not None,
         by_gimbal=sum(frame.pose_source == "gimbal" for frame in dataset.frames) > len(dataset) / 2,
         by_positions=_by_positions(dataset, before, after, refined.dataset, placed),
+        numbers=numbers,
     )
     return Compared(before, after, placed, turned, shifted, findings)
 
@@ -278,7 +283,7 @@ def _with_images(
         gain=gain,
         contradicted=contradicted(epipolar_px[1], method.lost),
         contradicted_before=contradicted(epipolar_px[0], method.lost),
-        moved_far=image_flags.moved_far(found.turned, found.shifted, distance),
-        blurred=image_flags.blurred(sharpness),
-        exposure_off=image_flags.exposure_off(gain),
+        moved_far=image_flags.moved_far(found.turned, found.shifted, distance, method.verdict),
+        blurred=image_flags.blurred(sharpness, method.verdict),
+        exposure_off=image_flags.exposure_off(gain, method.verdict),
     )

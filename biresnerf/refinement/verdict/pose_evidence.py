@@ -13,11 +13,15 @@ from biresnerf.refinement.lost.own_matches import LEAST_PX, OwnMatches, well_mat
 from biresnerf.refinement.views.compare_rigs import Rig
 from biresnerf.report import EpipolarEvidence
 
-LEAST_MATCHED = 4  # images
-
 
 def compare_on_matches(
-    before: Rig, after: Rig, tracks: Tracks, placed: NDArray[np.bool_], *, started_from_matches: bool
+    before: Rig,
+    after: Rig,
+    tracks: Tracks,
+    placed: NDArray[np.bool_],
+    least: int,
+    *,
+    started_from_matches: bool,
 ) -> EpipolarEvidence | None:
     """Each image's median epipolar error with either rig; None where too few images have matches.
 
@@ -26,16 +30,17 @@ def compare_on_matches(
 
     Args:
         placed: which images [n] had more than a guess for a pose before.
+        least: images with matches that say anything.
         started_from_matches: whether points not left out had a part in the rig `after`.
     """
     counted = placed if placed.any() else ~placed
-    enough = max(LEAST_MATCHED, int((well_matched(tracks, len(placed)) & counted).sum()) / 2)
+    enough = max(least, int((well_matched(tracks, len(placed)) & counted).sum()) / 2)
     judging = tracks.split()[1]
     figures = errors_px(before, after, judging) if judging is not None else None
     if figures is None or _known(figures, counted).sum() < enough:
         judging, figures = None, errors_px(before, after, tracks)
     known = _known(figures, counted)
-    if known.sum() < LEAST_MATCHED:
+    if known.sum() < least:
         return None
     one, other = (errors[known] for errors in figures)
     comparison = paired(one, other, MATCH_ERRORS, octaves(one, other, LEAST_PX))

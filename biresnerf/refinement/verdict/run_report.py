@@ -37,8 +37,6 @@ from biresnerf.refinement.views.floaters import unshared_opacity
 from biresnerf.report import CameraReport, HeldOut, ImageReport, Report
 from biresnerf.uncertainty import PoseUncertainty
 
-ONE_PLACE = 0.9  # of the matches, within 0.3 % of the photo's long side
-
 
 @dataclass(frozen=True, eq=False)
 class Findings:
@@ -101,7 +99,7 @@ def run_report(
         + turntable_warnings(scene.start)
         + accuracy_warnings(given, optimiser.options)
         + unmatched_warnings(scene)
-        + one_place_warnings(scene.tracks, refined)
+        + one_place_warnings(scene.tracks, refined, optimiser.method.verdict.one_place)
         + method_warnings(optimiser.recipe)
         + gpu_warnings(optimiser.device)
         + smaller_batches(optimiser.batch_share, optimiser.options.samples_per_step)
@@ -202,12 +200,12 @@ def unmatched_warnings(scene: Scene) -> tuple[str, ...]:
     )
 
 
-def one_place_warnings(tracks: Tracks | None, refined: RefinedPoses) -> tuple[str, ...]:
+def one_place_warnings(tracks: Tracks | None, refined: RefinedPoses, most: float) -> tuple[str, ...]:
     """A warning where rotations alone explain the feature matches, through the refined lenses."""
     if tracks is None or not np.isfinite(refined.world_from_cam).all():
         return ()
     share = explained_from_one_place(refined.dataset, tracks, refined.world_from_cam)
-    if share < ONE_PLACE:
+    if share < most:
         return ()
     return (
         f"The photos seem to have been taken from one place, as from a tripod: rotations alone explain {share:.0%} of "

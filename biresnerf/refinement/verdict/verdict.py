@@ -13,6 +13,7 @@ import numpy as np
 
 from biresnerf.arrays import Array
 from biresnerf.judging.compare import FITS_BELOW
+from biresnerf.refinement.numbers.choosing import VerdictNumbers
 from biresnerf.refinement.views.compare_rigs import photos_tell
 from biresnerf.report import (
     EpipolarEvidence,
@@ -23,12 +24,6 @@ from biresnerf.report import (
     VerdictName,
 )
 
-MEASURABLE_PX = 0.1  # at working size: less motion cannot be seen in photos of that size
-# Matches speak for poses only if the error that they lose is so large a share of the motion, but for one px of it:
-# poses that fitted well need not move far to fit a little better (docs/verdict.md).
-EXPLAINED, UNEXPLAINED_PX = 0.1, 1.0
-MOSTLY = 0.5  # share of cameras; if more fail a check, the whole set fails it
-FAR_DEG, FAR_SHARE = 60.0, 0.5  # median residuals; beyond, the result is only roughly in the input's frame
 VIEWS, MATCHES, POSITIONS = "unseen views", "feature matches", "measured positions"
 
 
@@ -42,7 +37,7 @@ class Findings:
         faults: sentences on what failed on our side.
         working_share: working size over the full size that `epipolar` is measured at.
         out_of_frame: a sentence if the refined poses fit the input's frame only roughly, else empty.
-        turned_far: whether the median camera ends turned by more than `FAR_DEG`.
+        turned_far: whether the median camera ends turned by more than `far_deg`.
         compared_with: where the input's poses come from.
         grounded: whether the input's poses are given ones or come from matches, and are not mere guesses.
         offset: whether an offset that all given poses shared was taken back.
@@ -68,6 +63,7 @@ class Findings:
     by_gimbal: bool = False
     determined: float | None = None
     may_be_blur: bool = False
+    numbers: VerdictNumbers = VerdictNumbers()
 
     @property
     def explained(self) -> bool:
@@ -76,7 +72,7 @@ class Findings:
             return False
         error = self.epipolar.error_px
         lost_px = (error.before - error.after) * self.working_share
-        return EXPLAINED * (self.moved_px - UNEXPLAINED_PX) < lost_px
+        return self.numbers.explained * (self.moved_px - self.numbers.unexplained_px) < lost_px
 
     @property
     def by_matches(self) -> Finding:
@@ -89,19 +85,19 @@ class Findings:
     @property
     def undetermined(self) -> bool:
         """Whether the evidence leaves most refined poses open: it may fit wrong ones as well."""
-        return self.determined is not None and self.determined < MOSTLY
+        return self.determined is not None and self.determined < self.numbers.mostly
 
 
-def failed_checks(refined: Array, lost: int) -> tuple[str, ...]:
+def failed_checks(refined: Array, lost: int, numbers: VerdictNumbers) -> tuple[str, ...]:
     """Sentences on what is inconsistent about refined poses [n, 4, 4]; `lost` cameras agree with no pose found."""
     if not np.isfinite(refined).all():
         return ("Refined poses are not finite.",)
-    if lost > MOSTLY * len(refined):
+    if lost > numbers.mostly * len(refined):
         return (f"{lost} of {len(refined)} cameras are lost: they agree with no pose that was found.",)
     return ()
 
 
-def frame_doubt(turned_deg: Array, shifted: Array, spread: float) -> str:
+def frame_doubt(turned_deg: Array, shifted: Array, spread: float, numbers: VerdictNumbers) -> str:
     """A sentence if refined poses end so far from the input's that its frame and scale are known only roughly.
 
     Args:
@@ -109,7 +105,7 @@ def frame_doubt(turned_deg: Array, shifted: Array, spread: float) -> str:
         spread: root-mean-square distance of the input's centres from their mean.
     """
     turn, shift = float(np.median(turned_deg)), float(np.median(shifted))
-    if not (turn > FAR_DEG or shift > FAR_SHARE * spread > 0):
+    if not (turn > numbers.far_deg or shift > numbers.far_share * spread > 0):
         return ""
     return (
         f"The refined poses fit the input's frame and scale only roughly: half of them are {turn:.3g} deg and "
@@ -141,8 +137,9 @@ def decide(findings: Findings) -> Verdict:
 def _judge(f: Findings) -> tuple[VerdictName, str]:
     if f.failed:
         return "failed_check", " ".join(f.failed)
-    if f.moved_px < MEASURABLE_PX:
-        return "unchanged", f"The poses moved by less than can be measured (below {MEASURABLE_PX:g} px)."
+    if f.moved_px < f.numbers.measurable_px:
+        least = f.numbers.measurable_px
+        return "unchanged", f"The poses moved by less than can be measured (below {least:g} px)."
     speaks_for, speaks_against = _who_say(f, "better"), _who_say(f, "worse")
     # Positions may be off by more than a narrow rig is wide. Rotations that far off are another arrangement.
     needed = {VIEWS, MATCHES} if f.turned_far else {MATCHES}
@@ -200,7 +197,7 @@ def _measures_the_same(f: Findings) -> bool:
     """Whether poses that matches gave and refined ones differ, and neither unseen views nor other matches tell how."""
     counted = _counted(f)
     both = len(counted) == 2 and all(item.finding == "same" for item in counted)
-    return f.compared_with == "seeded" and f.moved_px >= MEASURABLE_PX and both
+    return f.compared_with == "seeded" and f.moved_px >= f.numbers.measurable_px and both
 
 
 def _found_poses_yield(f: Findings) -> bool:
@@ -210,7 +207,7 @@ def _found_poses_yield(f: Findings) -> bool:
     """
     if f.compared_with != "seeded" or f.faults or _who_say(f, "worse"):
         return False
-    heeded = f.by_positions is not None and f.moved_px >= MEASURABLE_PX
+    heeded = f.by_positions is not None and f.moved_px >= f.numbers.measurable_px
     fits = f.epipolar is not None and f.epipolar.share_of_image <= FITS_BELOW
     return heeded or (fits and matches_are_better(f))
 
@@ -241,7 +238,7 @@ def _views_are_better(f: Findings) -> bool:
 def _views_tell(f: Findings) -> bool:
     """Whether unseen views may speak alone, or against matches: poses that fit photos better may miss them by far."""
     missed = f.heldout.missed_px if f.heldout is not None else None
-    return missed is None or (photos_tell(missed, f.moved_px) and not f.may_be_blur)
+    return missed is None or (photos_tell(missed, f.moved_px, f.numbers) and not f.may_be_blur)
 
 
 def matches_are_better(f: Findings) -> bool:

@@ -13,9 +13,10 @@ from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.workload import LOOKS, picture_share
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.judging.compare import UNSEEN_PSNR, UNSEEN_SSIM, compare, paired
+from biresnerf.refinement.numbers.choosing import VerdictNumbers
 from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.scene.scene import Scene
-from biresnerf.refinement.views.held_out_views import ROUNDS_MOST, unseen_rounds
+from biresnerf.refinement.views.held_out_views import unseen_rounds
 from biresnerf.refinement.views.image_metrics import shift_px
 from biresnerf.refinement.views.pose_trials import PoseTrials, Trial, TrialScores, joined
 from biresnerf.report import Finding, HeldOutEvidence
@@ -23,13 +24,6 @@ from biresnerf.report import Finding, HeldOutEvidence
 BeforeAfter = dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]]
 
 SHOWN = 4  # held-out views that are rendered with either rig, to be looked at
-# Poses that photos miss by less than half of a motion are nearer to the truth than those before it: the triangle's
-# inequality. Short trainings blur, and so miss by up to so much at true poses (px at working size, docs/verdict.md).
-NEARER, BLUR_PX = 0.5, 2.0
-# A gain of views that are missed by more than half of the motion must stand in trainings so many times as long.
-LONGER = 4
-# Before the end of a training chance is larger, as its rates have not fallen yet: 0.3 dB.
-EARLY = 2  # times what matters
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +51,7 @@ class Effort:
 
     Attributes:
         times: the steps that the options say are taken so many times.
-        rounds_most: small sets are trained so often, with other views left out, unless the first ones decide.
+        rounds_most: small sets are trained so often at most, with other views left out, unless the first ones decide.
         looks: shares of a training after which fields are compared; the last is 1.
         pictured: whether some held-out views are rendered with either rig, to be looked at.
         favoured: what other evidence says of the second rig.
@@ -65,7 +59,7 @@ class Effort:
     """
 
     times: int = 1
-    rounds_most: int = ROUNDS_MOST
+    rounds_most: int | None = None
     looks: tuple[float, ...] = LOOKS
     pictured: bool = False
     favoured: Finding = "open"
@@ -109,8 +103,8 @@ def compare_on_unseen_views(
     Raises:
         Interrupted: ``should_stop`` returned true.
     """
-    steps = effort.times * recipe.options.trial_steps
-    rounds = unseen_rounds(len(images), held_out)[: effort.rounds_most]
+    numbers, steps = recipe.method.verdict, effort.times * recipe.options.trial_steps
+    rounds = unseen_rounds(len(images), held_out, recipe.method.views)[: effort.rounds_most]
     if steps == 0 or not rounds[0]:
         return None
     rigs = [rig.world_from_cam for rig in pair]
@@ -137,7 +131,7 @@ def compare_on_unseen_views(
                 steps=running[0].optimiser.step_index, strictly=strictly, missed_px=missed_px,
                 psnr=paired(old.psnr, new.psnr, UNSEEN_PSNR), ssim=paired(old.ssim, new.ssim, UNSEEN_SSIM),
             )  # fmt: skip
-            decided = _decided(old, new, missed_px, EARLY if look < 1 else 1, effort)
+            decided = _decided(old, new, missed_px, numbers.early if look < 1 else 1, effort, numbers)
             if pictured and (decided or look == 1):
                 renders = _pictures(running, [view for view in views if view in held_out][:SHOWN], enough)
             did = work + sum(trial.work for trial in running)
@@ -165,19 +159,26 @@ def _missed_px(scores: TrialScores, images: ImageSet, views: Sequence[int]) -> f
     return float(np.median(missed))
 
 
-def photos_tell(missed_px: float, moved_px: float) -> bool:
+def photos_tell(missed_px: float, moved_px: float, numbers: VerdictNumbers) -> bool:
     """Whether renders with the better poses are near enough to the photos to tell others that differ by a motion."""
-    return missed_px <= max(BLUR_PX, NEARER * moved_px)
+    return missed_px <= max(numbers.blur_px, numbers.nearer * moved_px)
 
 
-def may_be_blur(evidence: HeldOutEvidence, effort: Effort) -> bool:
+def may_be_blur(evidence: HeldOutEvidence, effort: Effort, numbers: VerdictNumbers) -> bool:
     """Whether a gain may be that of poses which a short training's blur suits, and nothing else speaks for them."""
     if effort.favoured == "better" or evidence.psnr.finding != "better" or evidence.missed_px is None:
         return False
-    return NEARER * effort.moved_px < evidence.missed_px <= BLUR_PX
+    return numbers.nearer * effort.moved_px < evidence.missed_px <= numbers.blur_px
 
 
-def _decided(before: TrialScores, after: TrialScores, missed_px: float, times: float, effort: Effort) -> bool:
+def _decided(
+    before: TrialScores,
+    after: TrialScores,
+    missed_px: float,
+    times: float,
+    effort: Effort,
+    numbers: VerdictNumbers,
+) -> bool:
     """Whether both intervals lie beyond so many times what matters, on the same side; or beyond 0, on the favoured one.
 
     Other views, or more steps, would hardly change that. They may where a gain is not enough to tell yet.
@@ -190,7 +191,9 @@ def _decided(before: TrialScores, after: TrialScores, missed_px: float, times: f
 
     if effort.favoured in ("better", "worse") and says(effort.favoured, 0):
         return True
-    return photos_tell(missed_px, effort.moved_px) and (says("better", times) or says("worse", times))
+    return photos_tell(missed_px, effort.moved_px, numbers) and (
+        says("better", times) or says("worse", times)
+    )
 
 
 def compare_placed(

@@ -18,8 +18,6 @@ from biresnerf.refinement.optimise.photo_sampler import PixelBatch
 from biresnerf.refinement.optimise.renderer import Renderer
 from biresnerf.refinement.views.image_metrics import psnr, ssim
 
-FIT_STEPS, FIT_RATE, FIT_RAYS = 100, 1e-3, 1024  # BARF's test-time pose refinement
-FIT_EXPOSURE_RATE = 1e-2
 CHUNK = 8192  # rays rendered at once
 SWING_BELOW_DEG = 200.0  # cameras spread less than this about the scene: the orbit swings to and fro
 
@@ -45,7 +43,8 @@ class ViewScore:
 
 def fit_rays(method: Method, rays: int) -> int:
     """Rays of one step of fitting poses to the frozen field: as BARF, but no more than a large network can afford."""
-    return min(FIT_RAYS, rays) if method.large_network else FIT_RAYS
+    most = method.views.fit_rays
+    return min(most, rays) if method.large_network else most
 
 
 def fit_held_out_poses(optimiser: JointOptimiser, held_out: list[int]) -> None:
@@ -73,15 +72,16 @@ def fit_held_out_poses(optimiser: JointOptimiser, held_out: list[int]) -> None:
         with torch.no_grad():
             batch, rendering = seen(CHUNK)
     # Not longer than the field was trained, or a short run would take longer to measure than to do.
-    steps = FIT_STEPS if held else min(FIT_STEPS, optimiser.options.steps)
+    numbers = optimiser.method.views
+    steps = numbers.fit_steps if held else min(numbers.fit_steps, optimiser.options.steps)
     for step in range(steps):
         if not held:
             batch, rendering = seen(fit_rays(optimiser.method, optimiser.rays))
         colour = exposure.forgiven(exposure.shown(rendering, batch.image), batch.sharp)
         (optimiser.method.loss(colour, batch.sharp) * batch.weight[:, None]).mean().backward()
         if not held:
-            poses.step(FIT_RATE * 0.1 ** (step / steps), mobility)
-        exposure.step(FIT_EXPOSURE_RATE * 0.1 ** (step / steps))
+            poses.step(numbers.fit_rate * 0.1 ** (step / steps), mobility)
+        exposure.step(numbers.fit_exposure_rate * 0.1 ** (step / steps))
 
 
 @torch.no_grad()

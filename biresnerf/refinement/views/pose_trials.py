@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.errors import Interrupted
 from biresnerf.geometry.camera.camera_models import Camera
+from biresnerf.refinement.numbers.choosing import ViewNumbers
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.optimise.photo_sampler import PhotoSampler
@@ -25,17 +26,11 @@ from biresnerf.refinement.optimise.renderer import Renderer
 from biresnerf.refinement.scene.scene_frame import scene_frame
 from biresnerf.refinement.views.evaluation import render_view, score_views
 
-SAMPLES = 1 << 14  # a step
-ONE_IN, VIEWS_MOST = 5, 16  # unseen views: one in so many, but no more than that
-# Times the fine interval that a short training's field is rendered at, for 0.4 to 0.8 of the time: unseen views keep
-# their PSNR to 0.06 dB (fox, lego, fountain-P11). Trained at it, too, fountain-P11 loses 0.7 dB.
-COARSER = 2.0
-RAYS_PER_STEP = 100  # pixels of all unseen views that are rendered at the end, for each step of the training
 
-
-def trial_views(count: int) -> list[int]:
+def trial_views(count: int, numbers: ViewNumbers) -> list[int]:
     """Indices of the views of `count` that a trial does not train on, evenly spread."""
-    return list(range(ONE_IN // 2, count, max(ONE_IN, -(-count // VIEWS_MOST))))
+    one_in = numbers.one_in
+    return list(range(one_in // 2, count, max(one_in, -(-count // numbers.views_most))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +74,7 @@ class PoseTrials:
         self.steps = steps * self.kind.trial_steps
         # All of it stage 1, and the rates fall to their end: with the rates of a longer run's first half, trainings on
         # the same poses differ by 0.25 dB from seed to seed (lego at 100 px, 200 steps), so by 0.04.
-        self._recipe = recipe.apart(self.steps, (self.steps, self.steps), SAMPLES)
+        self._recipe = recipe.apart(self.steps, (self.steps, self.steps), recipe.method.views.trial_samples)
         self._should_stop = should_stop
         self._sampler = sampler or PhotoSampler(images, self.unseen, recipe.device, recipe.method.by_detail)
 
@@ -135,15 +130,20 @@ class Trial:
 
     def scores(self) -> TrialScores:
         """How well the field predicts the unseen views by now. The more steps, the more pixels are rendered."""
+        numbers = self.optimiser.method.views
         pixels = int(sum(self.images.widths[v] * self.images.heights[v] for v in self.unseen))
-        stride = max(1, math.ceil(math.sqrt(pixels / (RAYS_PER_STEP * self.optimiser.step_index))))
-        return score_unseen(self.optimiser.renderer, self.images, self.unseen, stride, COARSER)
+        stride = max(1, math.ceil(math.sqrt(pixels / (numbers.rays_per_step * self.optimiser.step_index))))
+        return score_unseen(self.optimiser.renderer, self.images, self.unseen, stride, numbers.coarser)
 
     def render(self, view: int) -> NDArray[np.float32]:
         """A view whole [h, w, 3], to be looked at."""
         matrices = self.optimiser.poses.matrices().detach()
         return render_view(
-            self.optimiser.renderer, matrices[view], view, as_photo=True, coarser=COARSER
+            self.optimiser.renderer,
+            matrices[view],
+            view,
+            as_photo=True,
+            coarser=self.optimiser.method.views.coarser,
         ).colour
 
 

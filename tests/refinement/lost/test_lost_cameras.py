@@ -18,7 +18,8 @@ from biresnerf.progress import Monitor
 from biresnerf.refinement.finish.outcome import Finish
 from biresnerf.refinement.lost import lost_cameras
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
-from biresnerf.refinement.optimise.methods import Recipe
+from biresnerf.refinement.optimise.method_changes import changed
+from biresnerf.refinement.optimise.methods import BIRESNERF, Method, Recipe
 from biresnerf.refinement.parameters.pose_parameters import PoseParameters
 from biresnerf.refinement.scene.scene_frame import scene_frame
 from biresnerf.refinement.stages.checkpoint import load_checkpoint
@@ -40,6 +41,8 @@ from tests.refinement.tiny_scene import (
 pytestmark = pytest.mark.slow
 
 SIZE, STEPS, PERIOD = 32, 160, 8
+# A budget for so short a run.
+GENEROUS = changed(BIRESNERF, {"lost.run_share": 10.0, "lost.event_share": 10.0})
 TURNED, ORBITED, HELD_OUT = 5, 3, [3, 8]
 
 
@@ -55,7 +58,11 @@ def true_poses(scene: tuple[Dataset, ImageSet]) -> np.ndarray:
 
 
 def start(
-    scene: tuple[Dataset, ImageSet], folder: Path, poses: np.ndarray, stop_at: int | None = None
+    scene: tuple[Dataset, ImageSet],
+    folder: Path,
+    poses: np.ndarray,
+    stop_at: int | None = None,
+    method: Method = GENEROUS,
 ) -> TinyRun:
     options = tiny_options(
         steps=STEPS,
@@ -67,7 +74,11 @@ def start(
         max_image_size=SIZE,
     )
     optimiser = JointOptimiser(
-        scene[1], scene_frame(scene[0].world_from_cam, scene[1]), poses, Recipe.of(options, CPU, 1), HELD_OUT
+        scene[1],
+        scene_frame(scene[0].world_from_cam, scene[1]),
+        poses,
+        Recipe.of(options, CPU, 1, method),
+        HELD_OUT,
     )
     return TinyRun(
         optimiser,
@@ -92,19 +103,10 @@ def errors_deg(run: TinyRun, truth: np.ndarray) -> np.ndarray:
     return camera_errors(align_robust(now, truth).apply_to_poses(now), truth).rotation_deg
 
 
-@pytest.fixture(autouse=True)
-def budget_for_so_short_a_run(monkeypatch):
-    monkeypatch.setattr(lost_cameras, "RUN_SHARE", 10.0)
-    monkeypatch.setattr(lost_cameras, "EVENT_SHARE", 10.0)
-
-
 @pytest.fixture(scope="module")
 def repaired(scene, tmp_path_factory) -> TinyRun:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lost_cameras, "RUN_SHARE", 10.0)
-        patch.setattr(lost_cameras, "EVENT_SHARE", 10.0)
-        run = start(scene, tmp_path_factory.mktemp("repaired"), spoiled(true_poses(scene)))
-        assert finished(run)
+    run = start(scene, tmp_path_factory.mktemp("repaired"), spoiled(true_poses(scene)))
+    assert finished(run)
     return run
 
 
@@ -161,9 +163,9 @@ def test_nothing_is_touched_on_a_healthy_run(scene, tmp_path, monkeypatch):
     assert errors_deg(run, true_poses(scene)).max() < 10
 
 
-def test_a_run_spends_no_more_than_its_share(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(lost_cameras, "RUN_SHARE", 0.2)
-    run = start(scene, tmp_path, spoiled(true_poses(scene)))
+def test_a_run_spends_no_more_than_its_share(scene, tmp_path):
+    frugal = changed(GENEROUS, {"lost.run_share": 0.2})
+    run = start(scene, tmp_path, spoiled(true_poses(scene)), method=frugal)
     finished(run)
     assert run.repair.repaired == [TURNED]  # the first one found takes all there is
     assert bool(run.optimiser.camera_errors.suspects[ORBITED])
@@ -226,12 +228,14 @@ def test_a_replaced_pose_has_no_momentum_and_others_keep_theirs():
 def test_cameras_placed_by_matches_are_not_sent_elsewhere(tmp_path, monkeypatch):
     dataset, images = tiny_set(tmp_path)
     optimiser = tiny_optimiser(
-        dataset, dataclasses.replace(images, background=None, alpha=None), tiny_options()
+        dataset,
+        dataclasses.replace(images, background=None, alpha=None),
+        tiny_options(),
+        method=changed(GENEROUS, {"lost.alone_most": 0.5}),
     )
     assert optimiser.frame.unbounded
     shared = torch.ones(len(dataset))
     shared[[2, 4]] = 0.0
-    monkeypatch.setattr(lost_cameras, "ALONE_MOST", 0.5)
     repair = lost_cameras.LostCameraRepair(optimiser)
     monkeypatch.setattr(repair, "_shared", lambda _matrices, _image: shared)
     sent: list[int] = []

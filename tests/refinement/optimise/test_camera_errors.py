@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from biresnerf.refinement.numbers.optimise import ErrorNumbers
 from biresnerf.refinement.optimise.camera_errors import CameraErrors, foreground_shares, outliers
 from tests.refinement.tiny_scene import CPU, photos_set, tiny_set
 
@@ -19,42 +20,42 @@ def spread_errors(seed: int, count: int = 40, sigma: float = 0.2) -> torch.Tenso
 
 @pytest.mark.parametrize("seed", range(5))
 def test_no_camera_of_a_healthy_rig_stands_out(seed):
-    assert not outliers(spread_errors(seed), NONE_HELD_OUT).any()
+    assert not outliers(spread_errors(seed), NONE_HELD_OUT, ErrorNumbers()).any()
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_the_camera_with_four_times_the_error_stands_out_alone(seed):
     errors = spread_errors(seed)
     errors[7] = 4 * errors.median()
-    assert torch.nonzero(outliers(errors, NONE_HELD_OUT))[:, 0].tolist() == [7]
+    assert torch.nonzero(outliers(errors, NONE_HELD_OUT, ErrorNumbers()))[:, 0].tolist() == [7]
 
 
 def test_neither_factor_nor_deviations_suffice_alone():
     calm = torch.full((40,), 0.01) + 1e-5 * torch.arange(40)
     calm[0] = 0.015  # many deviations, half as much again
-    assert not outliers(calm, NONE_HELD_OUT).any()
+    assert not outliers(calm, NONE_HELD_OUT, ErrorNumbers()).any()
     wide = spread_errors(0, sigma=1.0)
     wide[0] = 2.2 * wide.median()  # twice the median, within the spread
-    assert not outliers(wide, NONE_HELD_OUT)[0]
-    assert outliers(torch.where(torch.arange(40) == 0, 2.2e-2, 1e-2), NONE_HELD_OUT)[0]
+    assert not outliers(wide, NONE_HELD_OUT, ErrorNumbers())[0]
+    assert outliers(torch.where(torch.arange(40) == 0, 2.2e-2, 1e-2), NONE_HELD_OUT, ErrorNumbers())[0]
 
 
 def test_held_out_views_are_measured_by_their_own_median():
     errors = spread_errors(1, sigma=0.1)
     held_out = torch.arange(40) < 6
     errors[held_out] *= 3  # the field never saw them
-    assert not outliers(errors, held_out).any()
+    assert not outliers(errors, held_out, ErrorNumbers()).any()
     errors[2] *= 3
-    assert torch.nonzero(outliers(errors, held_out))[:, 0].tolist() == [2]
+    assert torch.nonzero(outliers(errors, held_out, ErrorNumbers()))[:, 0].tolist() == [2]
 
 
 def test_held_out_views_too_few_for_a_median_must_stand_out_further():
     errors = spread_errors(1, sigma=0.1)
     held_out = torch.arange(40) < 2
     errors[0] *= 3
-    assert not outliers(errors, held_out).any()
+    assert not outliers(errors, held_out, ErrorNumbers()).any()
     errors[0] *= 3
-    assert torch.nonzero(outliers(errors, held_out))[:, 0].tolist() == [0]
+    assert torch.nonzero(outliers(errors, held_out, ErrorNumbers()))[:, 0].tolist() == [0]
 
 
 def test_an_unseen_view_among_few_is_lost_only_if_most_of_its_photo_is_unexplained():

@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from biresnerf.data.photos.images import ImageSet
-from biresnerf.refinement.lost import lost_cameras
 from biresnerf.refinement.lost.lost_cameras import LostCameraRepair
 from biresnerf.refinement.optimise.camera_errors import CameraErrors, foreground_shares
+from biresnerf.refinement.optimise.method_changes import changed
+from biresnerf.refinement.optimise.methods import BIRESNERF
 from biresnerf.refinement.optimise.photo_sampler import PhotoSampler
 from biresnerf.refinement.optimise.pose_hypotheses import photo_distances
 from biresnerf.refinement.scene.scene_frame import scene_frame
-from biresnerf.refinement.views import evaluation
 from biresnerf.refinement.views.evaluation import fit_held_out_poses, score_views
 from biresnerf.refinement.views.image_metrics import psnr, ssim
 from tests.refinement.tiny_scene import CPU, photos_set, tiny_optimiser, tiny_options, tiny_set
@@ -109,14 +109,13 @@ def test_measures_of_photos_do_not_depend_on_what_is_masked(spoilt_twice):
     )
 
 
-def test_a_run_does_not_depend_on_what_is_masked(spoilt_twice, monkeypatch):
+def test_a_run_does_not_depend_on_what_is_masked(spoilt_twice):
     """Steps of both stages, a repair, fitting held-out poses, and scores: all the same to the bit."""
-    monkeypatch.setattr(lost_cameras, "ROUNDS", ((2, 24, 3), (1, 48, 3)))
-    monkeypatch.setattr(evaluation, "FIT_STEPS", 5)
+    method = changed(BIRESNERF, {"lost.rounds": ((2, 24, 3), (1, 48, 3)), "views.fit_steps": 5})
     dataset, *sets = spoilt_twice
     results = []
     for images in sets:
-        optimiser = tiny_optimiser(dataset, images, tiny_options(), [3])
+        optimiser = tiny_optimiser(dataset, images, tiny_options(), [3], method)
         for step in range(16):
             if step == 8:
                 optimiser.camera_errors.close_block()

@@ -16,16 +16,17 @@ from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.judging.compare import Rule
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.progress import Monitor
-from biresnerf.refinement.optimise.methods import Recipe
+from biresnerf.refinement.optimise.method_changes import changed
+from biresnerf.refinement.optimise.methods import BIRESNERF, Recipe
 from biresnerf.refinement.start import choose_start as start_module
 from biresnerf.refinement.start.choose_start import choose_start, find_start
 from biresnerf.refinement.start.first_step import pose_mobility, stage_lengths
 from biresnerf.refinement.start.matches_explained import explained_from_one_place, matches_explained
-from biresnerf.refinement.views import pose_trials
 from biresnerf.refinement.views.pose_trials import PoseTrials, trial_views
 from tests.refinement.tiny_scene import CPU, tiny_recipe, tiny_set, true_matches
 
 VIEWS, MOVING = 9, 100
+SHORT = changed(BIRESNERF, {"start.moving_steps": MOVING, "views.trial_samples": 8192})
 
 
 @pytest.fixture(scope="module")
@@ -37,8 +38,6 @@ def scene(tmp_path_factory):
 def short():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(start_module, "TRIAL_STEPS", 40)
-        patch.setattr(start_module, "MOVING_STEPS", MOVING)
-        patch.setattr(pose_trials, "SAMPLES", 8192)
         yield
 
 
@@ -50,7 +49,7 @@ def candidates(dataset, first: np.ndarray, second: np.ndarray) -> list[InitialPo
 
 
 def choose(images, tried: list[InitialPoses]) -> InitialPoses:
-    return choose_start(tried, images, [0.0] * len(tried), tiny_recipe(), lambda: False)
+    return choose_start(tried, images, [0.0] * len(tried), tiny_recipe(SHORT), lambda: False)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +76,7 @@ def test_trials_end_once_one_is_clearly_better(scene, monkeypatch):
     truth, works = dataset.world_from_cam, []
     for other in (perturb_poses(truth, 0.3, seed=1), truth):
         tried = candidates(dataset, other, truth)
-        choose_start(tried, images, [0.0, 0.0], tiny_recipe(), lambda: False, works.append)
+        choose_start(tried, images, [0.0, 0.0], tiny_recipe(SHORT), lambda: False, works.append)
     assert works == [2 * 120 / 4, 2 * (120 + MOVING)]
 
 
@@ -93,7 +92,7 @@ def test_trials_end_once_photos_prefer_poses_that_alone_explain_the_matches(scen
     def chosen(first: np.ndarray, second: np.ndarray) -> str:
         tried = candidates(dataset, first, second)
         explained = [matches_explained(dataset, tracks, c.world_from_cam) for c in tried]
-        return choose_start(tried, images, explained, tiny_recipe(), lambda: False, works.append).source
+        return choose_start(tried, images, explained, tiny_recipe(SHORT), lambda: False, works.append).source
 
     assert chosen(noisy, truth) == "matches-incremental"
     assert chosen(truth, noisy) == "given"
@@ -134,7 +133,7 @@ def test_good_given_poses_win_over_wrong_matches(scene):
 def test_without_matches_no_matched_poses_are_remembered(scene):
     dataset, images = scene
     given = InitialPoses(dataset.world_from_cam, "given", ("given",) * VIEWS)
-    found = find_start([given], dataset, images, None, tiny_recipe(), Monitor())
+    found = find_start([given], dataset, images, None, tiny_recipe(SHORT), Monitor())
     assert found.matched_poses is None
     kept = TypeAdapter(InitialPoses).validate_json(TypeAdapter(InitialPoses).dump_json(found))
     assert kept.matched_poses is None
@@ -176,7 +175,9 @@ def test_cameras_that_all_candidates_guess_have_no_say(scene):
 def test_poses_that_may_move_in_a_trial_improve(scene):
     dataset, images = scene
     noisy = perturb_poses(dataset.world_from_cam, 0.05, seed=1)
-    trials = PoseTrials(images, trial_views(VIEWS), [noisy], tiny_recipe(), 150, lambda: False)
+    trials = PoseTrials(
+        images, trial_views(VIEWS, SHORT.views), [noisy], tiny_recipe(SHORT), 150, lambda: False
+    )
     held, moved = (trials.begin(noisy, moving=moving) for moving in (False, True))
     for trial in (held, moved):
         trial.train(1.0)
@@ -278,7 +279,7 @@ def test_a_stop_ends_the_trial(scene):
     dataset, images = scene
     tried = candidates(dataset, dataset.world_from_cam, dataset.world_from_cam)
     with pytest.raises(Interrupted):
-        choose_start(tried, images, [0.0, 0.0], tiny_recipe(), lambda: True)
+        choose_start(tried, images, [0.0, 0.0], tiny_recipe(SHORT), lambda: True)
 
 
 @pytest.mark.slow

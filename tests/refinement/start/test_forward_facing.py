@@ -7,7 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from biresnerf.errors import InputError, Interrupted
-from biresnerf.refinement.start import forward_facing
+from biresnerf.refinement.optimise.method_changes import changed
+from biresnerf.refinement.optimise.methods import BIRESNERF
 from biresnerf.refinement.start.forward_facing import find_forward_facing, mirrored, resemblance_psnr
 from tests.refinement.tiny_scene import photos_set, tiny_recipe, tiny_set
 
@@ -69,12 +70,13 @@ def test_resemblance_is_that_of_the_best_mean_of_other_photos():
 
 
 @pytest.mark.slow
-def test_cameras_around_a_scene_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(forward_facing, "FIRST_STEPS", 60)
-    monkeypatch.setattr(forward_facing, "SECOND_STEPS", 30)
+def test_cameras_around_a_scene_are_refused(tmp_path):
+    recipe = tiny_recipe(
+        changed(BIRESNERF, {"start.facing_first_steps": 60, "start.facing_second_steps": 30})
+    )
     images = tiny_set(tmp_path, views=8, size=24)[1]
     with pytest.raises(InputError) as caught:
-        find_forward_facing(np.tile(np.eye(4), (8, 1, 1)), images, tiny_recipe(), lambda: False)
+        find_forward_facing(np.tile(np.eye(4), (8, 1, 1)), images, recipe, lambda: False)
     assert caught.value.code == "insufficient_overlap"
     assert caught.value.hint
     with pytest.raises(Interrupted):

@@ -20,6 +20,8 @@ from biresnerf.errors import InputError, Interrupted
 from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.geometry.similarity import align_by_spread
 from biresnerf.geometry.turntable import Ring
+from biresnerf.refinement.optimise.method_changes import changed
+from biresnerf.refinement.optimise.methods import BIRESNERF
 from biresnerf.refinement.start import turntable
 from biresnerf.refinement.start.ring_order import find_ring
 from biresnerf.refinement.start.turntable import Tried, at_elevation, likeliest_elevation, start_on_turntable
@@ -41,10 +43,10 @@ def turned_set(folder: Path, *, backwards: bool) -> tuple[InitialPoses, ImageSet
 
 
 @pytest.mark.slow
-def test_a_turning_scene_is_told_from_its_mirror_image_and_its_poses_approached(tmp_path, monkeypatch):
-    monkeypatch.setattr(turntable, "ELEVATIONS_DEG", (0.0, 30.0, 60.0))
+def test_a_turning_scene_is_told_from_its_mirror_image_and_its_poses_approached(tmp_path):
+    recipe = tiny_recipe(changed(BIRESNERF, {"start.elevations_deg": (0.0, 30.0, 60.0)}))
     even, images, true = turned_set(tmp_path / "set", backwards=True)
-    found = start_on_turntable(even, images, tiny_recipe(), lambda: False)
+    found = start_on_turntable(even, images, recipe, lambda: False)
 
     def error_deg(poses: np.ndarray) -> float:
         aligned = align_by_spread(poses, true).apply_to_poses(poses)
@@ -86,11 +88,12 @@ def test_the_likeliest_elevation_is_the_top_of_a_parabola_through_uneven_tries()
 
 def test_rings_to_try_turn_both_ways_from_where_the_axis_is_seen(tmp_path):
     even, images, _ = turned_set(tmp_path / "set", backwards=False)
-    forth, back = turntable.rings_to_try(images, find_ring(images, np.arange(VIEWS)))
+    elevations = BIRESNERF.start.elevations_deg
+    forth, back = turntable.rings_to_try(images, find_ring(images, np.arange(VIEWS)), elevations)
     step = 2 * math.pi / VIEWS
     for ring, other in zip(forth, back, strict=True):
         np.testing.assert_allclose(ring.azimuth.numpy(), step * np.arange(VIEWS), atol=1e-5)
         np.testing.assert_allclose(other.azimuth.numpy(), -ring.azimuth.numpy())
         assert abs(float(ring.pan)) < 0.03
-    assert [round(math.degrees(float(ring.elevation))) for ring in forth] == list(turntable.ELEVATIONS_DEG)
+    assert [round(math.degrees(float(ring.elevation))) for ring in forth] == list(elevations)
     np.testing.assert_allclose(even.world_from_cam, forth[1].matrices(), atol=1e-6)

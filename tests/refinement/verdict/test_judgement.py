@@ -14,7 +14,8 @@ from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.judging.compare import Rule
-from biresnerf.refinement.optimise.methods import Recipe
+from biresnerf.refinement.optimise.method_changes import changed
+from biresnerf.refinement.optimise.methods import BIRESNERF, Method, Recipe
 from biresnerf.refinement.verdict.judgement import Judgement, judge_poses
 from biresnerf.refinement.views import compare_rigs, pose_trials
 from biresnerf.refinement.views.held_out_views import unseen_rounds
@@ -32,6 +33,7 @@ from tests.refinement.tiny_scene import (
 pytestmark = pytest.mark.slow
 
 VIEWS = 14
+NUMBERS, VIEWED = BIRESNERF.verdict, BIRESNERF.views
 OPTIONS = tiny_options(trial_steps=60, samples_per_step=8192)
 
 
@@ -56,10 +58,11 @@ def judged(
     given: np.ndarray,
     refined: np.ndarray,
     tracks: Tracks | None = None,
+    method: Method = BIRESNERF,
 ) -> Judgement:
     """The verdict on a run that was given one set of poses and ended with the other."""
     dataset, images = scene
-    optimiser = tiny_optimiser(with_poses(dataset, refined), images, OPTIONS, held_out=[3])
+    optimiser = tiny_optimiser(with_poses(dataset, refined), images, OPTIONS, [3], method)
     run = replace(given_scene(with_poses(dataset, given), images, [3]), tracks=tracks)
     return judge_poses(*TinyRun(optimiser, run, Path()).parts)
 
@@ -75,23 +78,21 @@ def test_true_poses_miss_the_photos_by_less_than_wrong_ones(scene):
     truth = scene[0].world_from_cam
     noisy, other = (perturb_poses(truth, 0.3, seed=seed) for seed in (2, 3))
     right, wrong = (judged(scene, noisy, refined).verdict.heldout.missed_px for refined in (truth, other))
-    assert right < compare_rigs.BLUR_PX < wrong
+    assert right < NUMBERS.blur_px < wrong
     # Whichever is better: photos that are near the input's renders tell that the refined poses are worse.
-    assert judged(scene, truth, noisy).verdict.heldout.missed_px < compare_rigs.BLUR_PX
+    assert judged(scene, truth, noisy).verdict.heldout.missed_px < NUMBERS.blur_px
 
 
-def test_a_gain_that_may_be_blurs_must_stand_in_longer_trainings_unless_matches_speak(
-    scene, noisy, monkeypatch
-):
+def test_a_gain_that_may_be_blurs_must_stand_in_longer_trainings_unless_matches_speak(scene, noisy):
     truth, steps = scene[0].world_from_cam, OPTIONS.trial_steps
     alone, matched = (
         judged(scene, noisy, truth, tracks).verdict for tracks in (None, true_matches(scene[0]))
     )
-    assert (alone.verdict, alone.heldout.steps) == ("improved", compare_rigs.LONGER * steps)
-    assert compare_rigs.NEARER * matched.moved_px < matched.heldout.missed_px < compare_rigs.BLUR_PX
+    assert (alone.verdict, alone.heldout.steps) == ("improved", NUMBERS.longer * steps)
+    assert NUMBERS.nearer * matched.moved_px < matched.heldout.missed_px < NUMBERS.blur_px
     assert (matched.verdict, matched.heldout.steps <= steps) == ("improved", True)
-    monkeypatch.setattr(compare_rigs, "BLUR_PX", 0.1)  # poses that miss by more are not what blur suits
-    assert judged(scene, noisy, truth).verdict.heldout.steps <= steps
+    sharp = changed(BIRESNERF, {"verdict.blur_px": 0.1})  # poses that miss by more are not what blur suits
+    assert judged(scene, noisy, truth, method=sharp).verdict.heldout.steps <= steps
 
 
 def test_a_gain_that_may_be_blurs_says_nothing_where_time_ends_before_longer_trainings(scene, noisy):
@@ -108,7 +109,7 @@ def test_a_gain_that_may_be_blurs_says_nothing_where_time_ends_before_longer_tra
 
 def test_other_views_are_left_out_only_until_they_decide(scene):
     truth = scene[0].world_from_cam
-    first, second = unseen_rounds(VIEWS, [3])
+    first, second = unseen_rounds(VIEWS, [3], VIEWED)
     far, near = (judged(scene, perturb_poses(truth, noise, seed=1), truth).verdict for noise in (0.3, 0.02))
     assert far.heldout.psnr.count == len(first)
     assert near.heldout.psnr.count == len(first) + len(second)
@@ -189,8 +190,8 @@ def test_lost_frames_fail_the_check(scene):
     assert judgement.verdict.returned == "input"
 
 
-def test_images_whose_poses_were_guessed_have_no_part_in_the_trials(scene, noisy, monkeypatch):
-    monkeypatch.setattr(f"{judge_poses.__module__}.LONGER", 1)
+def test_images_whose_poses_were_guessed_have_no_part_in_the_trials(scene, noisy):
+    method = changed(BIRESNERF, {"verdict.longer": 1})
     dataset, images = scene
     truth = dataset.world_from_cam
 
@@ -200,7 +201,7 @@ def test_images_whose_poses_were_guessed_have_no_part_in_the_trials(scene, noisy
         frames = list(with_poses(dataset, given).frames)
         frames[1] = replace(frames[1], pose_source="nearest-view")
         run = given_scene(replace(dataset, frames=tuple(frames)), images, [3])
-        optimiser = tiny_optimiser(with_poses(dataset, refined), images, OPTIONS, held_out=[3])
+        optimiser = tiny_optimiser(with_poses(dataset, refined), images, OPTIONS, [3], method)
         return judge_poses(*TinyRun(optimiser, run, Path()).parts)
 
     found = judged_with_a_guess(truth[0])

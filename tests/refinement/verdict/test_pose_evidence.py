@@ -8,10 +8,13 @@ import pytest
 from biresnerf.data.photos.images import load_images
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.perturb import perturb_poses
+from biresnerf.refinement.numbers.choosing import VerdictNumbers
 from biresnerf.refinement.verdict.pose_evidence import compare_on_matches, working_share
 from biresnerf.refinement.views.compare_rigs import Rig
 from biresnerf.report import EpipolarEvidence
 from tests.refinement.tiny_scene import tiny_set, true_matches
+
+NUMBERS = VerdictNumbers()
 
 VIEWS = 14
 
@@ -43,7 +46,7 @@ def test_matches_of_points_left_out_judge_and_photos_placed_by_a_guess_do_not(sc
 
     def found(placed: np.ndarray, tracks: Tracks, *, started: bool) -> EpipolarEvidence:
         rigs = Rig(before, cameras), Rig(worse, cameras)
-        return compare_on_matches(*rigs, tracks, placed, started_from_matches=started)
+        return compare_on_matches(*rigs, tracks, placed, NUMBERS.least_matched, started_from_matches=started)
 
     judged_by_all = found(~guessed, tracks, started=True)
     assert judged_by_all.error_px.finding != "better"

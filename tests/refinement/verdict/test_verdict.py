@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from biresnerf.judging.compare import FITS_BELOW, MATCH_ERRORS, UNSEEN_PSNR, UNSEEN_SSIM, paired
+from biresnerf.refinement.optimise.methods import BIRESNERF
 from biresnerf.refinement.verdict.verdict import (
-    MEASURABLE_PX,
     Findings,
     decide,
     failed_checks,
@@ -83,7 +83,7 @@ def findings(
         (findings(held_out(0.05, similarity_gain=0.05)), "kept_input", "input"),
         (findings(held_out(4.0, views=1)), "inconclusive", "input"),
         (findings(), "inconclusive", "input"),
-        (findings(held_out(4.0), moved_px=MEASURABLE_PX / 2), "unchanged", "input"),
+        (findings(held_out(4.0), moved_px=BIRESNERF.verdict.measurable_px / 2), "unchanged", "input"),
         (findings(held_out(4.0), failed=("Gone.",)), "failed_check", "input"),
         (findings(held_out(4.0), matched(1.0), out_of_frame="Far."), "improved", "refined"),
         (findings(held_out(4.0), out_of_frame="Far."), "failed_check", "input"),
@@ -222,18 +222,18 @@ def test_what_improves_one_way_is_kept_the_other_way():
 
 def test_what_is_inconsistent_fails_the_check():
     poses = np.tile(np.eye(4), (6, 1, 1))
-    assert failed_checks(poses, lost=3) == ()
+    assert failed_checks(poses, 3, BIRESNERF.verdict) == ()
     broken = poses.copy()
     broken[2, 0, 3] = np.nan
-    assert "not finite" in failed_checks(broken, lost=0)[0]
-    assert "lost" in failed_checks(poses, lost=4)[0]
+    assert "not finite" in failed_checks(broken, 0, BIRESNERF.verdict)[0]
+    assert "lost" in failed_checks(poses, 4, BIRESNERF.verdict)[0]
 
 
 def test_poses_far_from_the_input_doubt_its_frame_and_the_verdict_says_so():
     still = np.zeros(6)
-    assert frame_doubt(still + 59, still + 0.4, 1.0) == ""
+    assert frame_doubt(still + 59, still + 0.4, 1.0, BIRESNERF.verdict) == ""
     for turned, shifted in ((still + 100, still), (still, still + 2)):
-        doubt = frame_doubt(turned, shifted, 1.0)
+        doubt = frame_doubt(turned, shifted, 1.0, BIRESNERF.verdict)
         assert "only roughly" in doubt
         assert doubt in decide(findings(held_out(4.0), matched(1.0), out_of_frame=doubt)).why[0]
 

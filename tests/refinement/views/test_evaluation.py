@@ -10,8 +10,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from biresnerf.data.synthetic.scene import synthetic_cameras
+from biresnerf.refinement.optimise.method_changes import changed
 from biresnerf.refinement.optimise.renderer import Renderer
-from biresnerf.refinement.views import evaluation
 from biresnerf.refinement.views.evaluation import fit_held_out_poses, orbit_poses, render_view, score_views
 from tests.refinement.tiny_scene import tiny_optimiser, tiny_options, tiny_set
 
@@ -115,8 +115,8 @@ def test_a_young_field_looks_the_same_at_coarser_intervals(trained, monkeypatch)
 
 
 def test_fitting_held_out_poses_moves_them_alone_and_no_field(trained, monkeypatch):
-    monkeypatch.setattr(evaluation, "FIT_STEPS", 8)
     optimiser, _ = trained
+    monkeypatch.setattr(optimiser, "method", changed(optimiser.method, {"views.fit_steps": 8}))
     before = {
         k: v.clone()
         for k, v in optimiser.state().items()
