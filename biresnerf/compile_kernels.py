@@ -34,6 +34,7 @@ from biresnerf.refinement.adjustment.evidence import Evidence, NoiseLevels, Patc
 from biresnerf.refinement.adjustment.patch_points import Surfaces, find_patches
 from biresnerf.refinement.kernels.batch_errors import add_errors
 from biresnerf.refinement.kernels.draw_pixels import draw_pixels
+from biresnerf.refinement.numbers.finish import EvidenceNumbers
 from biresnerf.refinement.optimise.pixel_chances import PixelChances
 from biresnerf.refinement.optimise.renderer import cast_rays, viewing_directions
 from biresnerf.refinement.parameters.pose_parameters import PoseParameters
@@ -155,9 +156,8 @@ def _adjust_two_cameras() -> None:
     photos = [np.repeat(0.5 + 0.4 * np.sin(20 * (x + shift))[..., None], 3, 2) for shift in (0.0, BASELINE)]
     seen = np.ones((SIZE, SIZE))
     surfaces = Surfaces([np.sqrt(1 + x**2 + y**2)] * 2, [seen] * 2, [seen > 0] * 2)
-    patches = find_patches(
-        poses, intrinsics, PatchPhotos.stacked([p.astype(np.float32) for p in photos]), surfaces, 8
-    )
+    stacked = PatchPhotos.stacked([p.astype(np.float32) for p in photos])
+    patches = find_patches(poses, intrinsics, stacked, surfaces, 8, EvidenceNumbers())
     left = np.stack(np.meshgrid(*[np.linspace(8.0, 24.0, 6)] * 2), 2).reshape(-1, 2)
     xy = np.stack([left, left - [SIZE * BASELINE, 0]], 1).reshape(-1, 2)
     tracks = Tracks(np.repeat(np.arange(len(left)), 2), np.tile(np.arange(2), len(left)), xy)

@@ -32,8 +32,9 @@ from biresnerf.geometry.similarity import align_by_spread
 from biresnerf.refinement.adjustment.adjustment import adjust_poses
 from biresnerf.refinement.adjustment.evidence import PosePrior
 from biresnerf.refinement.finish import given_poses as room
-from biresnerf.refinement.finish.candidates import PRIOR
-from biresnerf.refinement.finish.gather_evidence import MOST_OBSERVATIONS
+from biresnerf.refinement.numbers.finish import EvidenceNumbers
+
+PRIOR = EvidenceNumbers().prior
 
 Array = NDArray[np.float64]
 
@@ -72,7 +73,7 @@ def measured(truth: Dataset, seed: int) -> Iterator[dict[str, object]]:
 
     inputs = {f"{np.degrees(e):.2f} deg": disturbed(poses, e, distance, seed + 1) for e in ERRORS}
     inputs["COLMAP"] = matched.world_from_cam
-    for amount, most in (("all", MOST_OBSERVATIONS), ("few", FEW * len(truth))):
+    for amount, most in (("all", EvidenceNumbers().most_observations), ("few", FEW * len(truth))):
         evidence = fitted_tracks(truth, tracks, most)
         alone = adjust_poses(start, evidence, loose).world_from_cam
         for name, given in inputs.items():

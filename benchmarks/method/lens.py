@@ -38,9 +38,11 @@ from biresnerf.refinement.adjustment.evidence import Evidence, PosePrior
 from biresnerf.refinement.adjustment.ideal import straight_tracks
 from biresnerf.refinement.adjustment.lens.corrected_camera import corrected_camera
 from biresnerf.refinement.adjustment.lens.lenses import CENTRE, K1, K2, LENS
-from biresnerf.refinement.finish.candidates import PRIOR
 from biresnerf.refinement.finish.lens_evidence import lenses_before
 from biresnerf.refinement.finish.lens_model import supported_lenses
+from biresnerf.refinement.numbers.finish import EvidenceNumbers
+
+PRIOR = EvidenceNumbers().prior
 
 Array = NDArray[np.float64]
 
@@ -73,7 +75,7 @@ def main() -> None:
     held = adjust_poses(start, evidence, PosePrior.equal(start, PRIOR, PRIOR * distance))
     freed = adjust_poses(
         held.world_from_cam,
-        replace(evidence, lenses=lenses_before(given, "focal")),
+        replace(evidence, lenses=lenses_before(given, "focal", EvidenceNumbers())),
         PosePrior.equal(held.world_from_cam, PRIOR, PRIOR * distance),
     )
     for name, found in (("held", held), ("refined", freed)):
@@ -95,7 +97,7 @@ def compare_models(given: Dataset, tracks: Tracks, start: Array, focal: float) -
         for c in given.cameras
     )
     hid = replace(given, cameras=hidden, intrinsics_sources=("colmap",) * len(hidden))
-    evidence, before = fitted_tracks(hid, tracks), lenses_before(hid, "auto")
+    evidence, before = fitted_tracks(hid, tracks), lenses_before(hid, "auto", EvidenceNumbers())
     judging = straight_tracks(
         tracks, Intrinsics.from_cameras([hid.camera_of(i) for i in range(len(hid))]), evidence.intrinsics
     )

@@ -23,8 +23,10 @@ from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_by_spread
 from biresnerf.refinement.adjustment.adjustment import adjust_poses
 from biresnerf.refinement.adjustment.evidence import Evidence, PosePrior
-from biresnerf.refinement.finish.candidates import PRIOR
+from biresnerf.refinement.numbers.finish import EvidenceNumbers
 from biresnerf.studies.run_cell import peak_memory_bytes
+
+PRIOR = EvidenceNumbers().prior
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,9 @@ from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.refinement.adjustment.evidence import Evidence
 from biresnerf.refinement.adjustment.ideal import ideal_cameras, straight_tracks
-from biresnerf.refinement.finish.gather_evidence import MOST_OBSERVATIONS
+from biresnerf.refinement.numbers.finish import EvidenceNumbers
+
+MOST_OBSERVATIONS = EvidenceNumbers().most_observations
 
 
 def fitted_tracks(dataset: Dataset, tracks: Tracks | None, most: int = MOST_OBSERVATIONS) -> Evidence:

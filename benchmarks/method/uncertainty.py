@@ -26,8 +26,10 @@ from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_by_spread
 from biresnerf.refinement.adjustment.adjustment import adjust_poses
 from biresnerf.refinement.adjustment.evidence import PosePrior
-from biresnerf.refinement.finish.candidates import PRIOR
 from biresnerf.refinement.finish.expected_errors import expected_errors
+from biresnerf.refinement.numbers.finish import EvidenceNumbers
+
+PRIOR = EvidenceNumbers().prior
 
 Array = NDArray[np.float64]
 

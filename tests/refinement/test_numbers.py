@@ -16,6 +16,8 @@ from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.field.radiance_field import Merging
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.judging.compare import Rule
+from biresnerf.refinement.finish.gather_evidence import without_patches
+from biresnerf.refinement.finish.work_ahead import checks_ahead
 from biresnerf.refinement.lost.lost_cameras import LostCameraRepair
 from biresnerf.refinement.optimise.method_changes import changed, differences
 from biresnerf.refinement.optimise.methods import BIRESNERF
@@ -31,6 +33,7 @@ from tests.refinement.tiny_scene import (
     tiny_recipe,
     tiny_run,
     tiny_set,
+    true_matches,
 )
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -189,3 +192,27 @@ def test_the_verdict_takes_for_unchanged_what_the_method_cannot_measure(tiny, tm
     assert verdict.verdict.moved_px > 2 * BIRESNERF.verdict.measurable_px
     assert verdict.verdict.verdict == "unchanged"
     assert "50 px" in verdict.verdict.why[0]
+
+
+def test_cameras_are_adjusted_to_as_many_tracks_as_the_method_says(tiny):
+    scene = replace(given_scene(*tiny), tracks=true_matches(tiny[0]))
+    amounts = []
+    for most in (200, 10**6):
+        run = optimiser(tiny, {"evidence.most_observations": most})
+        placed = torch.ones(7, dtype=torch.bool).numpy()
+        fitted = without_patches(scene, run.joint, "auto", placed, run.method.evidence).fitted
+        assert fitted.numbers is run.method.evidence
+        amounts.append(len(fitted.tracks.point))
+    assert amounts[0] <= 200 < amounts[1]
+
+
+def test_photos_are_asked_about_motions_that_the_method_takes_for_seen(tiny, tmp_path):
+    dataset, images = tiny
+    matched = perturb_poses(dataset.world_from_cam, 0.02, seed=1)
+    scene = replace(given_scene(dataset, images), tracks=true_matches(dataset))
+    scene = replace(scene, start=replace(scene.start, matched_poses=matched))
+    asked = []
+    for unseen_px in (0.0, 100.0):
+        run = TinyRun(optimiser(tiny, {"finish.unseen_px": unseen_px}), scene, tmp_path)
+        asked.append(checks_ahead(*run.parts))
+    assert asked == [True, False]

@@ -15,7 +15,6 @@ from biresnerf.refinement.adjustment.kernels.patches import UNSEEN
 from biresnerf.refinement.adjustment.lens.lenses import (
     KINDS,
     LENS,
-    OBSERVABLE,
     Lenses,
     LensEstimate,
     posterior,
@@ -26,6 +25,7 @@ from biresnerf.refinement.adjustment.solver.covariance import covariance, of_eac
 from biresnerf.refinement.adjustment.solver.solve import Prior, minimise, normal_equations
 from biresnerf.refinement.adjustment.solver.term import Term
 from biresnerf.refinement.adjustment.track_term import ROBUST_SCALE, TrackTerm
+from biresnerf.refinement.numbers.finish import EvidenceNumbers
 
 
 @dataclass(frozen=True)
@@ -41,11 +41,13 @@ class Agreement:
     apart_deg: float
     moved_deg: float
     inliers: float
+    numbers: EvidenceNumbers
 
     @property
     def trusted(self) -> bool:
         """Whether the halves found much the same, from enough comparisons that fit."""
-        return self.apart_deg < MOST_APART * self.moved_deg + STILL_DEG and self.inliers > LEAST_INLIERS
+        bound_deg = self.numbers.most_apart * self.moved_deg + self.numbers.still_deg
+        return self.apart_deg < bound_deg and self.inliers > self.numbers.least_inliers
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,11 +60,6 @@ class Halves:
 
 
 NOTHING_FITS = ROBUST_SCALE**2  # a misfit is below it
-
-# On the demo scene the halves end 0.07 degrees apart where they moved 0.3, and a third of the comparisons fits; on lego
-# at 100 px, where patches do harm, they end 0.34 apart of 0.5, and a fifteenth fits.
-MOST_APART, LEAST_INLIERS = 0.3, 0.2
-STILL_DEG = 0.02  # halves this close agree, however little they moved
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +147,7 @@ def _adjusted(
         agreement=halves.agreement if halves else None,
         used=bool(terms),
         halves=halves,
-        lenses=_lens_estimate(found, terms, lenses) if lenses is not None else None,
+        lenses=_lens_estimate(found, terms, lenses, evidence.numbers) if lenses is not None else None,
     )
 
 
@@ -160,11 +157,12 @@ def _halves(cameras: Cameras, evidence: Evidence, prior: Prior) -> Halves:
     The noise level is what makes the covariance of the difference as large as the difference is.
     """
     assert evidence.patches is not None
-    even = np.arange(len(evidence.patches)) % 2 == 0
-    terms = [PatchTerm(evidence.patches.of(half), evidence.intrinsics, cameras) for half in (even, ~even)]
+    numbers, even = evidence.numbers, np.arange(len(evidence.patches)) % 2 == 0
+    parts = (evidence.patches.of(half) for half in (even, ~even))
+    terms = [PatchTerm(part, evidence.intrinsics, cameras, numbers) for part in parts]
     fitting = float(np.mean([term.inliers(cameras).mean() for term in terms]))
-    if not fitting > LEAST_INLIERS:  # the field shows no surface that photos agree on
-        return Halves(cameras, 1.0, Agreement(0.0, 0.0, fitting))
+    if not fitting > numbers.least_inliers:  # the field shows no surface that photos agree on
+        return Halves(cameras, 1.0, Agreement(0.0, 0.0, fitting, numbers))
     ends, expected, inliers = [], 0.0, []
     for term in terms:
         end = minimise(cameras, [term], prior)
@@ -177,7 +175,7 @@ def _halves(cameras: Cameras, evidence: Evidence, prior: Prior) -> Halves:
     middle = ends[1].moved(ends[0].apart(ends[1]) / 2)
     apart = _rotations_deg(ends[0], ends[1])
     agreement = Agreement(
-        float(apart.mean()), float(_rotations_deg(middle, cameras).mean()), float(np.mean(inliers))
+        float(apart.mean()), float(_rotations_deg(middle, cameras).mean()), float(np.mean(inliers)), numbers
     )
     noise = float(np.sqrt(np.mean(np.radians(apart) ** 2) / max(expected, 1e-300)))
     return Halves(middle, max(1.0, noise) if np.isfinite(noise) else 1.0, agreement)
@@ -188,13 +186,15 @@ def _rotations_deg(one: Cameras, other: Cameras) -> Array:
     return camera_errors(align_by_spread(a, b).apply_to_poses(a), b).rotation_deg
 
 
-def _lens_estimate(cameras: Cameras, terms: list[Term], lenses: Lenses) -> LensEstimate:
+def _lens_estimate(
+    cameras: Cameras, terms: list[Term], lenses: Lenses, numbers: EvidenceNumbers
+) -> LensEstimate:
     information = np.zeros((cameras.unknowns, cameras.unknowns))
     for term in terms:
         information += term.linearise(cameras, 0.0).system
     deviation = posterior(information, POSE * len(cameras), lenses)
     with np.errstate(invalid="ignore"):
-        observable = lenses.free & (deviation < OBSERVABLE * lenses.deviation)
+        observable = lenses.free & (deviation < numbers.observable * lenses.deviation)
     return LensEstimate(cameras.lens, deviation, observable)
 
 
@@ -248,4 +248,4 @@ def patch_term(cameras: Cameras, evidence: Evidence, noise: float) -> PatchTerm 
     """The finest term of the patches; None where there are none."""
     if evidence.patches is None or len(evidence.patches.target) == 0:
         return None
-    return PatchTerm(evidence.patches, evidence.intrinsics, cameras, noise, last_only=True)
+    return PatchTerm(evidence.patches, evidence.intrinsics, cameras, evidence.numbers, noise, last_only=True)

@@ -14,6 +14,7 @@ from biresnerf.geometry.focus import rms_spread
 from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.refinement.adjustment.lens.lenses import Lenses
 from biresnerf.refinement.adjustment.splines import blurred, spline_coefficients
+from biresnerf.refinement.numbers.finish import EvidenceNumbers
 
 EXACT = 1e-5  # of the spread of control points: no coordinates are more exact
 
@@ -146,6 +147,7 @@ class Evidence:
         patches: None where there are none.
         lenses: how the lenses differ from the intrinsics, and how well that is known; None: not at all.
         positions, control: None where none are measured, or they tell nothing.
+        numbers: what it is worth.
     """
 
     intrinsics: Intrinsics
@@ -154,6 +156,7 @@ class Evidence:
     lenses: Lenses | None = None
     positions: Positions | None = None
     control: Control | None = None
+    numbers: EvidenceNumbers = EvidenceNumbers()
 
     @property
     def held_by_measurements(self) -> NDArray[np.int64]:

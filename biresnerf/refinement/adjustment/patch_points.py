@@ -11,17 +11,13 @@ from biresnerf.arrays import Array
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.refinement.adjustment.evidence import Patches, PatchPhotos
 from biresnerf.refinement.adjustment.splines import blurred
+from biresnerf.refinement.numbers.finish import EvidenceNumbers
 
 # A patch's pixels about its middle one, as in Direct Sparse Odometry (Engel et al. 2018), made symmetric.
 PATTERN = np.array([[0, 0], [-2, 0], [2, 0], [0, -2], [0, 2], [-1, -1], [1, 1], [-1, 1]])
-OPAQUE = 0.97
 WINDOW = 2  # pixels of the depth map to either side that must lie on one plane
-FLATNESS = 0.01  # largest deviation from it, of the depth
-LEAST_GRADIENT = 0.01  # of the photo, 0 to 1 a pixel
 GRADIENT_BLUR_PX = 0.7
 BORDER = 5  # pixels of a photo that no patch or comparison comes closer to
-WIDEST = np.cos(np.radians(40.0))  # between the views of a patch that are compared
-AGREE = 0.03  # of the depth: the target sees the same place, not something before it
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +49,7 @@ def find_patches(
     photos: PatchPhotos,
     surfaces: Surfaces,
     per_photo: int,
+    numbers: EvidenceNumbers,
     seed: int = 0,
 ) -> Patches | None:
     """Patches of all photos, at most so many of each, with the photos to compare them with; None of none.
@@ -69,27 +66,30 @@ def find_patches(
     lens = lens * np.tile(ratio, 2)
     found = []
     for i in range(len(world_from_cam)):
-        planes = _planes(surfaces, i, lens[i], photos)
-        at = _chosen_pixels(photos, i, planes, per_photo, rng)
+        planes = _planes(surfaces, i, lens[i], photos, numbers)
+        at = _chosen_pixels(photos, i, planes, per_photo, numbers.least_gradient, rng)
         found.append((np.full(len(at), i), *_on_planes(at, planes, lens[i], photos, i)))
     host, rays, inverse = (np.concatenate(parts) for parts in zip(*found, strict=True))
     if len(host) == 0:
         return None
-    point, target = _targets(world_from_cam, lens, photos, surfaces, host, rays[:, 0], inverse[:, 0])
+    sights = host, rays[:, 0], inverse[:, 0]
+    point, target = _targets(world_from_cam, lens, photos, surfaces, *sights, numbers)
     if len(point) == 0:
         return None
     seen = np.bincount(point, minlength=len(host)) > 0
     return Patches(host, rays, inverse, point, target, photos).of(seen)
 
 
-def _planes(surfaces: Surfaces, image: int, lens: Array, photos: PatchPhotos) -> _Planes:
+def _planes(
+    surfaces: Surfaces, image: int, lens: Array, photos: PatchPhotos, numbers: EvidenceNumbers
+) -> _Planes:
     depth, opacity = surfaces.depth[image], surfaces.opacity[image]
     height, width = depth.shape
     step = np.array([photos.widths[image] / width, photos.heights[image] / height])
     x = ((np.arange(width) + 0.5) * step[0] - lens[2]) / lens[0]
     y = ((np.arange(height) + 0.5) * step[1] - lens[3]) / lens[1]
     inverse = np.sqrt(x[None] ** 2 + y[:, None] ** 2 + 1) / np.maximum(depth, 1e-9)
-    good = (opacity > OPAQUE) & surfaces.counts[image] & np.isfinite(inverse) & (depth > 1e-6)
+    good = (opacity > numbers.opaque) & surfaces.counts[image] & np.isfinite(inverse) & (depth > 1e-6)
     span = 2 * WINDOW + 1
     if height < span or width < span:
         return _Planes(np.zeros((3, height, width)), np.zeros((height, width), np.bool_))
@@ -104,12 +104,12 @@ def _planes(surfaces: Surfaces, image: int, lens: Array, photos: PatchPhotos) ->
     inner = np.s_[WINDOW : height - WINDOW, WINDOW : width - WINDOW]
     planes, usable = np.zeros((3, height, width)), np.zeros((height, width), np.bool_)
     planes[(slice(None), *inner)] = plane.transpose(2, 0, 1)
-    usable[inner] = solid & (off_plane < FLATNESS * plane[..., 0]) & (plane[..., 0] > 0)
+    usable[inner] = solid & (off_plane < numbers.flatness * plane[..., 0]) & (plane[..., 0] > 0)
     return _Planes(planes, usable)
 
 
 def _chosen_pixels(
-    photos: PatchPhotos, image: int, planes: _Planes, count: int, rng: np.random.Generator
+    photos: PatchPhotos, image: int, planes: _Planes, count: int, least: float, rng: np.random.Generator
 ) -> NDArray[np.int64]:
     """Columns and rows [k, 2] of textured pixels on usable surface, no two of them neighbours."""
     width, height = int(photos.widths[image]), int(photos.heights[image])
@@ -122,7 +122,7 @@ def _chosen_pixels(
         image,
         planes.usable.shape,
     )
-    able = planes.usable[cell[..., 1], cell[..., 0]] & (steep > LEAST_GRADIENT)
+    able = planes.usable[cell[..., 1], cell[..., 0]] & (steep > least)
     able[:BORDER], able[-BORDER:], able[:, :BORDER], able[:, -BORDER:] = False, False, False, False
     rows, columns = np.nonzero(able)
     order = np.argsort(-np.sqrt(steep[rows, columns]) * rng.random(len(rows)))
@@ -169,18 +169,19 @@ def _targets(
     host: NDArray[np.int64],
     rays: Array,
     inverse: Array,
+    numbers: EvidenceNumbers,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Patch and photo of each comparison [m]: photos that see the place from near enough, unhidden."""
     rotation, centre = world_from_cam[:, :3, :3], world_from_cam[:, :3, 3]
     xyz = np.einsum("pij,pj->pi", rotation[host], rays) / inverse[:, None] + centre[host]
     from_host = xyz - centre[host]
     from_host /= np.linalg.norm(from_host, axis=1, keepdims=True)
-    points, targets = [], []
+    points, targets, widest = [], [], np.cos(np.radians(numbers.widest_deg))
     for j in range(len(world_from_cam)):
         away = xyz - centre[j]
         distance = np.maximum(np.linalg.norm(away, axis=1), 1e-12)
         q = away @ rotation[j]
-        front = (host != j) & (q[:, 2] > 1e-3 * distance) & ((from_host * away).sum(1) > WIDEST * distance)
+        front = (host != j) & (q[:, 2] > 1e-3 * distance) & ((from_host * away).sum(1) > widest * distance)
         with np.errstate(divide="ignore", invalid="ignore"):
             xy = q[:, :2] / q[:, 2:] * lens[j, :2] + lens[j, 2:]
         size = np.array([photos.widths[j], photos.heights[j]])
@@ -188,8 +189,8 @@ def _targets(
         at = np.flatnonzero(inside)
         cell = _cells(xy[at].astype(np.int64), photos, j, surfaces.depth[j].shape)
         own = np.s_[cell[:, 1], cell[:, 0]]
-        agrees = np.abs(surfaces.depth[j][own] - distance[at]) < AGREE * distance[at]
-        at = at[agrees & (surfaces.opacity[j][own] > OPAQUE) & surfaces.counts[j][own]]
+        agrees = np.abs(surfaces.depth[j][own] - distance[at]) < numbers.agree * distance[at]
+        at = at[agrees & (surfaces.opacity[j][own] > numbers.opaque) & surfaces.counts[j][own]]
         points.append(at)
         targets.append(np.full(len(at), j))
     point, target = np.concatenate(points), np.concatenate(targets)

@@ -20,18 +20,12 @@ from biresnerf.refinement.adjustment.kernels.patches import (
 )
 from biresnerf.refinement.adjustment.solver.in_parts import in_parts
 from biresnerf.refinement.adjustment.solver.term import Linearised
+from biresnerf.refinement.numbers.finish import EvidenceNumbers
 
 Seen = tuple[object, ...]  # what all kernels read
 Result = TypeVar("Result")
 
-# Expected of a pixel, 0 to 1: its own noise, and by how much of a pixel resampling and surface are off.
-PIXEL_NOISE, PIXEL_SHIFT = 0.01, 0.1
-SCALE_DEVIATION = 0.03  # of a patch's depth, relative
 LONGEST_SCALE_STEP = 0.02
-# From coarse to fine: blur of the photos (px), and the error at which a comparison has lost three quarters of its
-# weight. What decides is how soon that falls at the end: on the demo scene 3 left 0.20 degrees, 1.5 left 0.105 and
-# 0.7 left 0.065.
-LEVELS = ((1.0, 5.0), (0.5, 1.5), (0.5, 0.7))
 
 
 class PatchTerm:
@@ -52,19 +46,21 @@ class PatchTerm:
         patches: Patches,
         intrinsics: Intrinsics,
         cameras: Cameras,
+        numbers: EvidenceNumbers,
         noise: float = 1.0,
         *,
         last_only: bool = False,
     ) -> None:
         photos = patches.photos
-        self.patches, self.noise = patches, noise
-        self._levels = list(LEVELS[-1:] if last_only else LEVELS)
+        self.patches, self.noise, self._numbers = patches, noise, numbers
+        self._levels = list(numbers.patch_levels[-1:] if last_only else numbers.patch_levels)
         self.start = np.searchsorted(patches.point, np.arange(len(patches) + 1)).astype(np.int64)
         self.lens = lens_rows(intrinsics, cameras)
         ratio = [photos.widths / intrinsics.width.numpy(), photos.heights / intrinsics.height.numpy()]
         self.lens[:, :4] *= np.stack(ratio * 2, 1)
         self.frames = np.stack([photos.offsets[:-1], photos.widths, photos.heights], 1).astype(np.int64)
         self.unknowns = np.ones(len(patches))
+        self._expected = numbers.pixel_noise, numbers.pixel_shift
         self._blur, self.scale = self._levels[0]
         self.blur(self._blur)
 
@@ -91,14 +87,13 @@ class PatchTerm:
     def squares(self, cameras: Cameras, scales: Array) -> Array:
         """Mean square [m] of each comparison."""
         squared = np.empty(len(self.patches.target))
-        self._in_parts(
-            lambda part: patch_errors(*part[1], PIXEL_NOISE, PIXEL_SHIFT, squared), cameras, scales
-        )
+        self._in_parts(lambda part: patch_errors(*part[1], *self._expected, squared), cameras, scales)
         return squared
 
     def settle(self, cameras: Cameras) -> None:
         """The depths' scales that fit best, for cameras that stay."""
-        fixed = PIXEL_NOISE, PIXEL_SHIFT, self.scale, SCALE_DEVIATION, 2 * SCALE_DEVIATION
+        deviation = self._numbers.scale_deviation
+        fixed = *self._expected, self.scale, deviation, 2 * deviation
         self._in_parts(lambda part: settle_scales(*part[1], *fixed), cameras, self.unknowns)
 
     def inliers(self, cameras: Cameras) -> NDArray[np.bool_]:
@@ -109,13 +104,14 @@ class PatchTerm:
         square, most = self.squares(cameras, unknowns), self.scale**2
         robust = np.where(square < UNSEEN, most * square / (most + square), most)
         count = self.values.shape[1] * self.values.shape[2]
-        away = (unknowns - 1) / SCALE_DEVIATION
+        away = (unknowns - 1) / self._numbers.scale_deviation
         return float(count * robust.sum() / self.noise**2 + (away**2).sum())
 
     def linearise(self, cameras: Cameras, damping: float) -> Linearised:
         size = cameras.unknowns
         rows = cameras.rows(self.patches.host), cameras.rows(self.patches.target)
-        fixed = PIXEL_NOISE, PIXEL_SHIFT, self.scale, SCALE_DEVIATION, self.noise, damping
+        deviation = self._numbers.scale_deviation
+        fixed = *self._expected, self.scale, deviation, self.noise, damping
         of_target = np.zeros(rows[1].shape)
 
         def linearised(part: tuple[slice, Seen]) -> tuple[Array, Array, tuple[Array, ...]]:

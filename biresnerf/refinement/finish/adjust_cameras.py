@@ -50,7 +50,8 @@ def adjust_cameras(
         if moves:
             repair.place_by_matches()
         placed = ~optimiser.camera_errors.doubted.cpu().numpy()
-        gathered = gather_evidence(scene, optimiser.renderer, optimiser.options, placed)
+        numbers = optimiser.method.evidence
+        gathered = gather_evidence(scene, optimiser.renderer, optimiser.options, placed, numbers)
         found = choose_poses(scene, optimiser.joint, gathered, optimiser.options, announce)
     if found is None:
         return Finish()

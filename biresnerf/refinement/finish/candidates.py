@@ -29,9 +29,6 @@ ORDER: tuple[CandidateName, ...] = (
 # Candidates that patches were to be trusted for, and that patches left out prefer: photos have spoken for them.
 BY_PATCHES: tuple[CandidateName, ...] = ("adjusted", "adjusted-patches")
 BY_TRACKS: tuple[CandidateName, ...] = ("adjusted", "adjusted-tracks")
-# Standard deviations of the refined poses' errors, rad and distances of the cameras from the scene: far more than they
-# have, so that only what no evidence fixes is left to them.
-PRIOR = 0.02
 
 
 def adjust(

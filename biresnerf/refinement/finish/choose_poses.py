@@ -24,7 +24,6 @@ from biresnerf.refinement.adjustment.solver.covariance import NOTHING_KNOWN
 from biresnerf.refinement.finish.candidates import (
     BY_TRACKS,
     ORDER,
-    PRIOR,
     adjust,
     as_candidate,
     without_adjustment,
@@ -46,10 +45,6 @@ logger = logging.getLogger(__name__)
 # As COLMAP left them: the input's, of photos alone.
 OF_MATCHES: tuple[CandidateName, ...] = ("input", "matched")
 SAME_POSES = 1e-6
-# Of tracks, in px or in shares of the photos' size. Sets have 0.1 to 0.5 px.
-MOST_NOISE_PX, MOST_NOISE = 2.0, 0.002
-# Poses nearer than this to those that tracks prefer, in standard deviations of a camera's pose, may be the true ones.
-TOLD_APART = 2.0
 
 
 def choose_poses(
@@ -106,7 +101,7 @@ def choose_poses(
         results[chosen.name] = result
         chosen = as_candidate(chosen.name, result, heeded_now, cameras) or chosen
     best = results.get(chosen.name) or next(iter(results.values()), None)
-    kept = given_focals(scene.dataset, options.refine_intrinsics)
+    kept = given_focals(scene.dataset, options.refine_intrinsics, split.fitted.numbers)
     focals = focal_certainty(
         best,
         split.fitted,
@@ -123,7 +118,7 @@ def _adjusted(
     announce: Callable[[], None],
 ) -> tuple[SplitEvidence, PosePrior, dict[CandidateName, Adjustment]]:
     """The evidence with the lenses that it supports, what is known before, and the poses adjusted to both."""
-    loose = np.full(len(refined), PRIOR)
+    loose = np.full(len(refined), split.fitted.numbers.prior)
     loose[split.fitted.held_by_measurements] = NOTHING_KNOWN  # a prior would hold a bend of all cameras
     prior = PosePrior(refined, loose, loose * joint.frame.distance, joint.bodies)
     lenses = supported_lenses(refined, split.fitted, split.left_out, prior, cameras, announce)
@@ -195,7 +190,7 @@ def _within(
         expected_errors(each.world_from_cam, by_tracks.world_from_cam, evidence, bodies=bodies)
         for each in candidates
     )
-    return np.array([each.deviations < TOLD_APART for each in found])
+    return np.array([each.deviations < evidence.numbers.told_apart for each in found])
 
 
 def _misfit(candidate: Candidate, evidence: Evidence, noise: NoiseLevels) -> Array:
@@ -248,4 +243,4 @@ def _tells(misfits: Array) -> bool:
 def _most_noise_px(evidence: Evidence) -> float:
     """More is no feature's noise: the tracks are wrong."""
     size = torch.maximum(evidence.intrinsics.width, evidence.intrinsics.height).double().median()
-    return max(MOST_NOISE_PX, MOST_NOISE * float(size))
+    return max(evidence.numbers.most_noise_px, evidence.numbers.most_noise * float(size))

@@ -22,11 +22,6 @@ from biresnerf.refinement.adjustment.solver.covariance import (
 )
 from biresnerf.refinement.adjustment.solver.solve import ROUNDS, SETTLED
 
-# Root mean square errors (rad) beyond this are not known: the poses' errors are no longer linear in the residuals.
-MOST_ROTATION = 0.1
-# Errors of lenses, of photos and of the field's surface are alike in many residuals and do not average out: by how much
-# they make errors larger than the noise does.
-TRACK_MODEL_ERROR, PATCH_MODEL_ERROR = 3.0, 1.25
 NORMAL_90 = 1.2816  # of a normal deviate: one in ten is above it
 
 
@@ -100,7 +95,7 @@ def expected_errors(
         patch_noise: level of the patches' noise, as the adjustment found it.
         bodies: cameras that are fixed or move as one; they say what of the frame is free.
     """
-    cameras, lenses = Cameras.of(preferred, evidence.lenses), evidence.lenses
+    cameras, lenses, numbers = Cameras.of(preferred, evidence.lenses), evidence.lenses, evidence.numbers
     n = len(cameras)
     by_tracks, by_patches = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
     information = np.zeros((cameras.unknowns, cameras.unknowns))
@@ -110,11 +105,11 @@ def expected_errors(
             if tracks.measure(cameras) < SETTLED:
                 break
         by_tracks[tracks.image] = True
-        information += tracks.linearise(cameras, 0.0).system / TRACK_MODEL_ERROR**2
+        information += tracks.linearise(cameras, 0.0).system / numbers.track_model_error**2
     if patches is not None:
         patches.settle(cameras)
         by_patches[patches.patches.target] = by_patches[patches.patches.host] = True
-        information += patches.linearise(cameras, 0.0).system / PATCH_MODEL_ERROR**2
+        information += patches.linearise(cameras, 0.0).system / numbers.patch_model_error**2
     for term in measured_terms(evidence, cameras).values() if information.any() else ():
         term.measure(cameras)
         information += term.linearise(cameras, 0.0).system
@@ -125,7 +120,7 @@ def expected_errors(
         information[6 * n :, 6 * n :] += np.diag(before)
         information = without_lenses(information, cameras, lenses.free.reshape(-1))
     found = of_each(covariance(cameras, information, (by_tracks | by_patches) & together, bodies))
-    known = together & (_rotation(found) < MOST_ROTATION)
+    known = together & (_rotation(found) < numbers.most_rotation)
     if not known.all():  # what is not known must not turn the others' frame
         found = of_each(covariance(cameras, information, known, bodies))
     away = np.full((n, 6), np.nan)
@@ -134,7 +129,7 @@ def expected_errors(
         frame = frame or align_by_spread(preferred[known], world_from_cam[known])
         away = Cameras.of(frame.apply_to_poses(preferred)).apart(Cameras.of(world_from_cam)).reshape(n, 6)
         found = _turn(frame) @ found @ _turn(frame).T
-        known &= np.sqrt((away[:, :3] ** 2).sum(1)) < MOST_ROTATION
+        known &= np.sqrt((away[:, :3] ** 2).sum(1)) < numbers.most_rotation
     away[~known], found[~known] = np.nan, np.nan
     return ExpectedErrors(away, found, by_tracks, by_patches)
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from biresnerf.arrays import Array
-from biresnerf.data.model.dataset import Dataset, IntrinsicsSource
+from biresnerf.data.model.dataset import Dataset
 from biresnerf.geometry.camera.camera_models import REFINED_PARAMETERS, Camera
 from biresnerf.geometry.camera.lens import lens_problem
 from biresnerf.options.refine_options import RefineIntrinsics
@@ -26,28 +26,14 @@ from biresnerf.refinement.adjustment.lens.lenses import (
     TANGENTIAL,
     Lenses,
 )
+from biresnerf.refinement.numbers.finish import EvidenceNumbers
 from biresnerf.refinement.parameters.intrinsics_parameters import FocalCertainty
 
-# Standard deviation of a focal length, as a share of it, by who found it. Guesses: over 13 sets of photos of all kinds,
-# the logarithm of the focal length over the guess (1.2 of the long side) has 0.4. What COLMAP found says nothing
-# before: it is of the same matches; what a network predicts counts as a guess, what a maker measured as given. EXIF:
-# whole millimetres of 35 mm film, and what stabilisation cuts off.
-FOCAL_DEVIATION: dict[IntrinsicsSource, float] = {
-    "given": 0.02, "maker": 0.02, "exif": 0.05, "predicted": 0.4, "colmap": 0.4, "guessed": 0.4
-}  # fmt: skip
-# Of distortion, as it moves the image's corner, as a share of its distance.
-RADIAL_DEVIATION, TANGENTIAL_DEVIATION = 0.1, 0.01
-# Of the principal point, as a share of the long side: six calibrated sets of photos have 0.3 to 3 %, in the root mean
-# square 1.1 % of either coordinate. Of the ratio of focal lengths: they have 0 to 0.4 %.
-CENTRE_DEVIATION, ASPECT_DEVIATION = 0.01, 0.005
 # The parameters that some models lack.
 OF_MODELS = {K1: "k1", K2: "k2", 5: "p1", 6: "p2", ASPECT: "fy"}
-# A given focal length is contradicted if another one is preferred by more than so many standard deviations of what is
-# known before and of what the evidence says together.
-FOCAL_CONTRADICTED = 2.0
 
 
-def lenses_before(dataset: Dataset, option: RefineIntrinsics) -> Lenses:
+def lenses_before(dataset: Dataset, option: RefineIntrinsics, numbers: EvidenceNumbers) -> Lenses:
     """What may move of the lenses, and how well it is known: all that was not given, or as the option asks.
 
     A lens that was given keeps its model; one that was not may get any.
@@ -57,13 +43,13 @@ def lenses_before(dataset: Dataset, option: RefineIntrinsics) -> Lenses:
         source = dataset.source_of_intrinsics(i)
         if option == "none" or (option == "auto" and source == "given"):
             continue
-        deviation[i, FOCAL] = FOCAL_DEVIATION[source]
+        deviation[i, FOCAL] = numbers.focal_deviation(source)
         if option != "focal":
             far, lens = corner(camera), camera.full()
-            deviation[i, [K1, K2]] = RADIAL_DEVIATION / far**2, RADIAL_DEVIATION / far**4
-            deviation[i, TANGENTIAL] = TANGENTIAL_DEVIATION / far
-            deviation[i, CENTRE] = CENTRE_DEVIATION * max(camera.width, camera.height) / lens.fx
-            deviation[i, ASPECT] = ASPECT_DEVIATION
+            deviation[i, [K1, K2]] = numbers.radial_deviation / far**2, numbers.radial_deviation / far**4
+            deviation[i, TANGENTIAL] = numbers.tangential_deviation / far
+            deviation[i, CENTRE] = numbers.centre_deviation * max(camera.width, camera.height) / lens.fx
+            deviation[i, ASPECT] = numbers.aspect_deviation
             if source == "given":
                 names = REFINED_PARAMETERS[camera.model]
                 lacking = [number for number, name in OF_MODELS.items() if name not in names]
@@ -71,11 +57,11 @@ def lenses_before(dataset: Dataset, option: RefineIntrinsics) -> Lenses:
     return _lenses(dataset, deviation)
 
 
-def given_focals(dataset: Dataset, option: RefineIntrinsics) -> Lenses:
+def given_focals(dataset: Dataset, option: RefineIntrinsics, numbers: EvidenceNumbers) -> Lenses:
     """The focal lengths that are to stay as they were given, as if they might move."""
     given = [dataset.source_of_intrinsics(i) == "given" for i in range(len(dataset.cameras))]
     deviation = np.zeros((len(given), LENS))
-    deviation[given if option == "auto" else [], 0] = FOCAL_DEVIATION["given"]
+    deviation[given if option == "auto" else [], 0] = numbers.focal_deviation("given")
     return _lenses(dataset, deviation)
 
 
@@ -143,7 +129,7 @@ def contradicted_focals(
         clear = (
             observable
             and found == "better"
-            and abs(off) > FOCAL_CONTRADICTED * np.hypot(kept.deviation[i, 0], deviation)
+            and abs(off) > fitted.numbers.focal_contradicted * np.hypot(kept.deviation[i, 0], deviation)
         )
         said[i] = FocalCertainty(_known(deviation), observable, float(np.exp(off)) if clear else None)
     return said

@@ -15,15 +15,11 @@ from biresnerf.judging.compare import FREER_LENS, is_better
 from biresnerf.refinement.adjustment.adjustment import Adjustment, adjust_poses, track_term
 from biresnerf.refinement.adjustment.cameras import POSE, Cameras
 from biresnerf.refinement.adjustment.evidence import Evidence, PosePrior
-from biresnerf.refinement.adjustment.lens.lenses import FOCAL, K1, KINDS, LENS, OBSERVABLE, Lenses, posterior
+from biresnerf.refinement.adjustment.lens.lenses import FOCAL, K1, KINDS, LENS, Lenses, posterior
 from biresnerf.refinement.adjustment.solver.solve import Prior, newton_step
 from biresnerf.refinement.adjustment.track_term import ROBUST_SCALE
-from biresnerf.refinement.finish.expected_errors import TRACK_MODEL_ERROR
 
 logger = logging.getLogger(__name__)
-
-
-MOST_OBSERVATIONS = 20_000  # more tell the same
 
 
 def supported_lenses(
@@ -49,7 +45,7 @@ def supported_lenses(
         return lenses
     if fitted.tracks is None or left_out.tracks is None:
         return kept
-    tracks = fitted.tracks.thinned(MOST_OBSERVATIONS, len(world_from_cam))
+    tracks = fitted.tracks.thinned(fitted.numbers.lens_observations, len(world_from_cam))
     fitted, left_out = replace(fitted, tracks=tracks, patches=None), replace(left_out, patches=None)
     best = adjust_poses(world_from_cam, replace(fitted, lenses=kept), prior)
     for kind in KINDS:
@@ -92,8 +88,8 @@ def _told(best: Adjustment, fitted: Evidence, prior: PosePrior, kept: Lenses) ->
     moved = np.abs(cameras.split(step)[1])
     deviation = posterior(linear.system, POSE * len(cameras), lenses)
     with np.errstate(invalid="ignore"):
-        known = lenses.free & ~kept.free & (deviation < OBSERVABLE * lenses.deviation)
-        return np.asarray((known & (moved > TRACK_MODEL_ERROR * deviation)).any(1))
+        known = lenses.free & ~kept.free & (deviation < fitted.numbers.observable * lenses.deviation)
+        return np.asarray((known & (moved > fitted.numbers.track_model_error * deviation)).any(1))
 
 
 def _pays(found: Adjustment, best: Adjustment, left_out: Evidence) -> bool:

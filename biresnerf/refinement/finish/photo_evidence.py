@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from biresnerf.data.photos.images import ImageSet, load_images
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.options.refine_options import ResolvedOptions
-from biresnerf.refinement.adjustment.evidence import Patches, PatchPhotos
+from biresnerf.refinement.adjustment.evidence import Evidence, Patches, PatchPhotos
 from biresnerf.refinement.adjustment.ideal import resized, straight_photo
 from biresnerf.refinement.adjustment.patch_points import Surfaces, find_patches
 from biresnerf.refinement.optimise.renderer import Renderer
@@ -17,7 +17,6 @@ from biresnerf.refinement.views.evaluation import render_view
 
 MOST_PIXELS = 6_000_000  # of all photos together: 70 MB for each blur that they are compared at
 MOST_RAYS = 200_000  # of all depth maps together; they get every second, third, ... row and column beyond
-MOST_PATCHES, PATCHES_OF_PHOTO = 3000, (20, 200)  # in all, and the least and the most of one photo
 
 
 def photo_patches(
@@ -25,7 +24,7 @@ def photo_patches(
     renderer: Renderer,
     options: ResolvedOptions,
     intrinsics: Intrinsics,
-    ideal: Intrinsics,
+    evidence: Evidence,
     placed: NDArray[np.bool_],
 ) -> Patches | None:
     """Patches of the photos that are `placed` [n], at the present poses.
@@ -34,7 +33,12 @@ def photo_patches(
     """
     if intrinsics.some_fisheye:
         return None
-    images, joint = _larger(scene, options), renderer.joint
+    images, joint, ideal, numbers = (
+        _larger(scene, options),
+        renderer.joint,
+        evidence.intrinsics,
+        evidence.numbers,
+    )
     widths, heights = images.widths.astype(np.int64), images.heights.astype(np.int64)
     lenses, straight = resized(intrinsics, widths, heights), resized(ideal, widths, heights)
     gains = joint.exposure.gains()
@@ -53,9 +57,9 @@ def photo_patches(
         photos.append(np.ascontiguousarray(photo))
         seen.append(shown)
     surfaces = _surfaces(renderer, ideal, seen)
-    per_photo = int(np.clip(MOST_PATCHES // len(photos), *PATCHES_OF_PHOTO))
+    per_photo = int(np.clip(numbers.most_patches // len(photos), *numbers.patches_of_photo))
     stacked = PatchPhotos.stacked(photos)
-    return find_patches(joint.unit_from_cam, ideal, stacked, surfaces, per_photo, seed=options.seed)
+    return find_patches(joint.unit_from_cam, ideal, stacked, surfaces, per_photo, numbers, options.seed)
 
 
 def _larger(scene: Scene, options: ResolvedOptions) -> ImageSet:

@@ -18,11 +18,8 @@ from biresnerf.refinement.views.motion import moved_px
 
 logger = logging.getLogger(__name__)
 
-# In px at working size. Poses nearer to the truth than this predict unseen photos as well as it does (docs/verdict.md).
-UNSEEN_PX = 0.5
 
-
-def photos_will_be_asked(scene: Scene, present: NDArray[np.float64]) -> bool:
+def photos_will_be_asked(scene: Scene, present: NDArray[np.float64], unseen_px: float) -> bool:
     """Whether photos will have to judge the adjusted cameras, as far as the present poses tell.
 
     Cameras that are adjusted to tracks end near those that matches placed: where the present ones are as near, photos
@@ -33,7 +30,7 @@ def photos_will_be_asked(scene: Scene, present: NDArray[np.float64]) -> bool:
         return True
     lenses = tuple(scene.dataset.camera_of(i) for i in range(len(scene.dataset)))
     carried = align_robust(matched, present, with_rotations=True).apply_to_poses(matched)
-    return moved_px(Rig(present, lenses), Rig(carried, lenses), scene.images) >= UNSEEN_PX
+    return moved_px(Rig(present, lenses), Rig(carried, lenses), scene.images) >= unseen_px
 
 
 def photos_object(scene: Scene, joint: JointParameters, recipe: Recipe, run: RunState, other: Rig) -> bool:
@@ -48,7 +45,7 @@ def photos_object(scene: Scene, joint: JointParameters, recipe: Recipe, run: Run
     refined = joint.lenses.refined(scene.dataset)
     present = Rig(joint.unit_from_cam, tuple(refined.camera_of(i) for i in range(len(refined))))
     moved = moved_px(present, other, scene.images)
-    if moved < UNSEEN_PX:
+    if moved < recipe.method.finish.unseen_px:
         logger.info("the adjusted cameras moved by %.2f px, which photos do not show", moved)
         return False
     run.announce("checking the adjusted cameras by the photos")

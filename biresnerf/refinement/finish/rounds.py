@@ -13,7 +13,6 @@ from biresnerf.refinement.stages.run_state import RunState
 from biresnerf.refinement.stages.two_stages import TwoStages
 
 AFTER: tuple[Phase, ...] = ("adjusting", "evaluating", "judging")  # phases that follow the last step
-SLACK = 0.05  # of a run's time budget
 
 
 def run_rounds(stages: TwoStages, scene: Scene) -> Finish:
@@ -29,6 +28,7 @@ def run_rounds(stages: TwoStages, scene: Scene) -> Finish:
         RefinementError: ``diverged``.
     """
     optimiser, run, repair = stages.optimiser, stages.run, stages.repair
+    slack_s = optimiser.method.finish.slack * optimiser.options.time_budget_s
     first: Finish | None = None
     if not run.record.adjusted:
         stages.run_stage_2(FIRST_ROUND)
@@ -37,14 +37,14 @@ def run_rounds(stages: TwoStages, scene: Scene) -> Finish:
             stages.begin_block()
             optimiser.end_after(LEARNING)
         over = optimiser.poses_held and first.heeds_photos
-        again = not over and _time_to_adjust_again(run, optimiser.options.time_budget_s)
+        again = not over and _time_to_adjust_again(run, slack_s)
         run.note(
             adjusted=True, candidates=first.candidates, believed=first.fit is not None, adjusts_again=again
         )
         stages.replan()
     stages.run_stage_2()
     held, then = optimiser.poses_held, run.record
-    again = then.adjusts_again and _time_to_adjust_again(run, optimiser.options.time_budget_s)
+    again = then.adjusts_again and _time_to_adjust_again(run, slack_s)
     if first is not None and not again:
         return first
     if not again and not then.believed:
@@ -55,10 +55,10 @@ def run_rounds(stages: TwoStages, scene: Scene) -> Finish:
     return replace(last, candidates=then.candidates) if chosen_then else last
 
 
-def _time_to_adjust_again(run: RunState, budget_s: float) -> bool:
+def _time_to_adjust_again(run: RunState, slack_s: float) -> bool:
     """Whether there is time for a second adjustment, as long as the first, and for what follows it.
 
     The steps were chosen so that there just is: it must not be left out for a moment that they took longer.
     """
     after_s = sum(run.monitor.forecast.seconds(phase) for phase in AFTER)
-    return after_s < run.left_s + SLACK * budget_s
+    return after_s < run.left_s + slack_s

@@ -32,8 +32,6 @@ from biresnerf.refinement.start.first_step import adjusts_cameras
 logger = logging.getLogger(__name__)
 
 PHOTOS_LOOKED_AT, SMALL = 3, 64  # to see whether there is a background, and px
-LEAST = 0.1  # of the steps asked for: with fewer, poses move but do not improve
-WRITING = 0.03  # of the budget, for the files of the result
 OVERDRAWN = 1.1  # times the budget: the report warns of more
 
 
@@ -95,7 +93,9 @@ def work_ahead(
 def checks_ahead(scene: Scene, optimiser: JointOptimiser, run: RunState) -> bool:
     """Whether photos will judge the adjusted cameras."""
     adjusts = adjusts_cameras(scene.dataset, optimiser.method) and not run.record.adjusted
-    return adjusts and scene.tracks is not None and photos_will_be_asked(scene, optimiser.joint.unit_from_cam)
+    if not adjusts or scene.tracks is None:
+        return False
+    return photos_will_be_asked(scene, optimiser.joint.unit_from_cam, optimiser.method.finish.unseen_px)
 
 
 def adjustment(scene: Scene) -> float:
@@ -114,7 +114,7 @@ def keep_to_budget(
     if not seconds:
         run.keep_to(partial(expect_as_measured, scene, optimiser, run))
         return
-    ends = started + (1 - WRITING) * seconds - sum(run.record.seconds.values())
+    ends = started + (1 - optimiser.method.finish.writing) * seconds - sum(run.record.seconds.values())
     run.keep_to(partial(choose_steps, scene, optimiser, run, steps_asked), ends)
 
 
@@ -133,7 +133,9 @@ def choose_steps(scene: Scene, optimiser: JointOptimiser, run: RunState, most: i
     """Leave a run as many steps as there is time for, `most` in all; fewer where poses stand still from now on."""
     before = optimiser.schedule.steps
     high = max(FEWEST_STEPS, round((FIRST_ROUND + LEARNING) * most)) if optimiser.poses_held else most
-    low = min(high, max(optimiser.step_index, round(LEAST * most), FEWEST_STEPS))
+    low = min(
+        high, max(optimiser.step_index, round(optimiser.method.finish.least_steps * most), FEWEST_STEPS)
+    )
     left_s, checks = run.left_s, checks_ahead(scene, optimiser, run)
 
     def needed_s(steps: int) -> float:

@@ -19,6 +19,7 @@ from biresnerf.field.radiance_field import FieldShape, Merging, RadianceField
 from biresnerf.options.presets import MethodName
 from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refinement.numbers.choosing import StartNumbers, VerdictNumbers, ViewNumbers
+from biresnerf.refinement.numbers.finish import EvidenceNumbers, FinishNumbers
 from biresnerf.refinement.numbers.lost import LostNumbers
 from biresnerf.refinement.numbers.optimise import ErrorNumbers, ScheduleNumbers, SwitchNumbers
 from biresnerf.refinement.optimise.schedule import Schedule
@@ -60,6 +61,7 @@ class Method:
         course, errors, switch, kinds, lost: numbers of the schedule, of cameras that stand out, of the switch to
             stage 2, of open scenes, and of lost cameras.
         start, views, verdict: numbers of the start, of unseen views, and of the verdict.
+        evidence, finish: numbers of what all cameras are adjusted to, and of when that is done.
     """
 
     build_field: BuildField
@@ -90,6 +92,8 @@ class Method:
     start: StartNumbers = StartNumbers()
     views: ViewNumbers = ViewNumbers()
     verdict: VerdictNumbers = VerdictNumbers()
+    evidence: EvidenceNumbers = EvidenceNumbers()
+    finish: FinishNumbers = FinishNumbers()
 
     def scheduled(self, options: ResolvedOptions, frame: SceneFrame) -> Schedule:
         """The schedule of a run in a scene."""

@@ -21,7 +21,7 @@ from biresnerf.refinement.finish.expected_errors import ExpectedErrors
 from biresnerf.refinement.finish.gather_evidence import measured_evidence
 from biresnerf.refinement.finish.outcome import Finish
 from biresnerf.refinement.lost.own_matches import contradicted
-from biresnerf.refinement.numbers.choosing import VerdictNumbers
+from biresnerf.refinement.numbers.finish import EvidenceNumbers
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.methods import Method
 from biresnerf.refinement.parameters.joint_parameters import JointParameters
@@ -116,7 +116,7 @@ def judge_poses(
     joint, numbers, most = optimiser.joint, optimiser.method.verdict, optimiser.method.views.rounds_most
     refined = RefinedPoses.now(scene.dataset, joint)
     lost = int(optimiser.camera_errors.lost.sum())
-    found = compare_without_training(scene, refined, lost, numbers)
+    found = compare_without_training(scene, refined, lost, optimiser.method)
     # Only then it matters what the evidence determines: to know it, a matrix of all cameras is inverted.
     asked = matches_are_better(found.findings) and optimiser.method.uncertainty
     errors = _errors(refined, joint, finish) if asked else None
@@ -176,11 +176,9 @@ class Compared:
     findings: Findings
 
 
-def compare_without_training(
-    scene: Scene, refined: RefinedPoses, lost: int, numbers: VerdictNumbers
-) -> Compared:
+def compare_without_training(scene: Scene, refined: RefinedPoses, lost: int, method: Method) -> Compared:
     """The input's poses and refined ones by motion and feature matches; `lost` cameras agree with no pose found."""
-    dataset, images = scene.dataset, scene.images
+    dataset, images, numbers = scene.dataset, scene.images, method.verdict
     rows = range(len(dataset))
     before = Rig(dataset.world_from_cam, tuple(dataset.camera_of(i) for i in rows))
     after = Rig(refined.world_from_cam, tuple(refined.dataset.camera_of(i) for i in rows))
@@ -215,18 +213,23 @@ def compare_without_training(
         faults=tuple(map(str, dataset.faults)),
         offset=dataset.body_offset is not None,
         by_gimbal=sum(frame.pose_source == "gimbal" for frame in dataset.frames) > len(dataset) / 2,
-        by_positions=_by_positions(dataset, before, after, refined.dataset, placed),
+        by_positions=_by_positions(dataset, before, after, refined.dataset, placed, method.evidence),
         numbers=numbers,
     )
     return Compared(before, after, placed, turned, shifted, findings)
 
 
 def _by_positions(
-    dataset: Dataset, before: Rig, after: Rig, refined: Dataset, placed: NDArray[np.bool_]
+    dataset: Dataset,
+    before: Rig,
+    after: Rig,
+    refined: Dataset,
+    placed: NDArray[np.bool_],
+    numbers: EvidenceNumbers,
 ) -> Finding | None:
     """What measured places say of the refined poses; see `Findings`."""
-    old = measured_evidence(dataset, before.world_from_cam, placed)
-    new = measured_evidence(refined, after.world_from_cam, placed)
+    old = measured_evidence(dataset, before.world_from_cam, placed, numbers)
+    new = measured_evidence(refined, after.world_from_cam, placed, numbers)
     if old.positions is None or new.positions is None:
         old, new = replace(old, positions=None), replace(new, positions=None)
     told = new.control is not None and control_believed(new, Cameras.of(after.world_from_cam))

@@ -77,11 +77,11 @@ def poses_so_far(scene: Scene, optimiser: JointOptimiser, run: RunState) -> SoFa
 def _verdict(scene: Scene, optimiser: JointOptimiser, refined: RefinedPoses) -> Verdict:
     """By all but unseen views; where nothing else speaks for or against them, refined poses are offered."""
     lost = int(optimiser.camera_errors.lost.sum())
-    findings = compare_without_training(scene, refined, lost, optimiser.method.verdict).findings
+    findings = compare_without_training(scene, refined, lost, optimiser.method).findings
     if matches_are_better(findings) and optimiser.method.uncertainty:
         placed = ~optimiser.camera_errors.doubted.cpu().numpy()
         of_lenses, joint = optimiser.options.refine_intrinsics, optimiser.joint
-        evidence = without_patches(scene, joint, of_lenses, placed).fitted
+        evidence = without_patches(scene, joint, of_lenses, placed, optimiser.method.evidence).fitted
         errors = expected_errors(joint.unit_from_cam, joint.unit_from_cam, evidence, bodies=joint.bodies)
         findings = replace(findings, determined=float(errors.known.mean()))
     verdict = decide(findings)

@@ -13,8 +13,11 @@ from biresnerf.refinement.adjustment.adjustment import adjust_poses
 from biresnerf.refinement.adjustment.cameras import Cameras
 from biresnerf.refinement.adjustment.evidence import Evidence, PosePrior
 from biresnerf.refinement.adjustment.solver.body_motions import body_columns, rigid_motion
-from biresnerf.refinement.finish.expected_errors import TRACK_MODEL_ERROR, expected_errors
+from biresnerf.refinement.finish.expected_errors import expected_errors
+from biresnerf.refinement.numbers.finish import EvidenceNumbers
 from tests.refinement.adjustment.rig import disturbed, observed, pinholes, ring
+
+TRACK_MODEL_ERROR = EvidenceNumbers().track_model_error
 
 CAMERAS = 10
 FIXED = RigidBodies(np.arange(CAMERAS), np.isin(np.arange(CAMERAS), [0, 4, 7]))

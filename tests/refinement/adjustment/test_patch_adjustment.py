@@ -12,9 +12,12 @@ from biresnerf.refinement.adjustment.cameras import Cameras
 from biresnerf.refinement.adjustment.evidence import Evidence, NoiseLevels, PatchPhotos, PosePrior
 from biresnerf.refinement.adjustment.lens.lenses import Lenses
 from biresnerf.refinement.adjustment.patch_points import Surfaces, find_patches
-from biresnerf.refinement.adjustment.patch_term import PIXEL_NOISE, PIXEL_SHIFT, SCALE_DEVIATION, PatchTerm
+from biresnerf.refinement.adjustment.patch_term import PatchTerm
 from biresnerf.refinement.adjustment.splines import blurred, spline_coefficients
+from biresnerf.refinement.numbers.finish import EvidenceNumbers
 from tests.refinement.adjustment.rig import disturbed, look_at_origin, rotation_errors_deg
+
+NUMBERS = EvidenceNumbers()
 
 SIZE, FOCAL = 64, 80.0
 
@@ -63,7 +66,9 @@ class Plane:
 
     def evidence(self, poses, per_photo=40):
         return Evidence(
-            self.intrinsics, None, find_patches(poses, self.intrinsics, self.photos, self.surfaces, per_photo)
+            self.intrinsics,
+            None,
+            find_patches(poses, self.intrinsics, self.photos, self.surfaces, per_photo, NUMBERS),
         )
 
 
@@ -91,7 +96,7 @@ def test_normal_equations_are_those_of_autograd(rng, correction):
     lens_of = [0, 0, 1]
     lenses = correction and Lenses(np.array(lens_of), np.array(correction), np.ones((2, 8)))
     cameras = Cameras.of(poses, lenses)
-    term = PatchTerm(evidence.patches, evidence.intrinsics, cameras)
+    term = PatchTerm(evidence.patches, evidence.intrinsics, cameras, NUMBERS)
     term.scale = 1.5
     at = term.linearise(cameras, 0.0)
 
@@ -125,13 +130,13 @@ def test_normal_equations_are_those_of_autograd(rng, correction):
     to_cameras, to_scale = torch.autograd.functional.jacobian(residuals, (unknown, scale), vectorize=True)
     square = torch.from_numpy(term.squares(cameras, np.ones(count)))
     variance = (r**2).mean(1) / square
-    assert (variance >= PIXEL_NOISE**2).all()
-    assert (variance <= PIXEL_NOISE**2 + PIXEL_SHIFT**2).all()
+    assert (variance >= NUMBERS.pixel_noise**2).all()
+    assert (variance <= NUMBERS.pixel_noise**2 + NUMBERS.pixel_shift**2).all()
     weight = ((1.5**2 / (1.5**2 + square)) ** 2 / variance)[:, None].expand_as(r).reshape(-1)
     j_cameras, j_scales = to_cameras.reshape(-1, cameras.unknowns), to_scale.reshape(-1, count)
     flat = r.reshape(-1)
     u, w = j_cameras.T @ (weight[:, None] * j_cameras), j_cameras.T @ (weight[:, None] * j_scales)
-    v = j_scales.T @ (weight[:, None] * j_scales) + torch.eye(count) / SCALE_DEVIATION**2
+    v = j_scales.T @ (weight[:, None] * j_scales) + torch.eye(count) / NUMBERS.scale_deviation**2
     system = u - w @ torch.linalg.solve(v, w.T)
     right = j_cameras.T @ (weight * flat) - w @ torch.linalg.solve(v, j_scales.T @ (weight * flat))
     np.testing.assert_allclose(at.system, system.numpy(), rtol=1e-4, atol=1e-5 * float(system.abs().max()))
@@ -162,7 +167,7 @@ def test_patches_that_have_nothing_in_common_move_no_camera(rng):
     noise = rng.uniform(0, 1, plane.photos.values.shape).astype(np.float32)
     photos = PatchPhotos.stacked([noise[: SIZE * SIZE].reshape(SIZE, SIZE, 3)] * 9)
     photos.values[:] = noise
-    patches = find_patches(start, plane.intrinsics, photos, plane.surfaces, 40)
+    patches = find_patches(start, plane.intrinsics, photos, plane.surfaces, 40, NUMBERS)
     found = adjust_poses(
         start, Evidence(evidence.intrinsics, None, patches), PosePrior.equal(start, 0.02, 0.06)
     )
@@ -188,4 +193,4 @@ def test_photos_without_patches_are_no_evidence(rng, kind):
         surfaces = Surfaces(surfaces.depth, surfaces.opacity, [np.zeros((SIZE, SIZE), np.bool_)] * 4)
     if kind == "one colour":
         photos = PatchPhotos.stacked([np.full((SIZE, SIZE, 3), 0.5, np.float32)] * 4)
-    assert find_patches(plane.truth, plane.intrinsics, photos, surfaces, 40) is None
+    assert find_patches(plane.truth, plane.intrinsics, photos, surfaces, 40, NUMBERS) is None

@@ -12,6 +12,7 @@ from biresnerf.refinement.adjustment.cameras import Cameras
 from biresnerf.refinement.adjustment.evidence import Evidence
 from biresnerf.refinement.adjustment.measured_terms import control_believed
 from biresnerf.refinement.finish.gather_evidence import measured_evidence
+from biresnerf.refinement.numbers.finish import EvidenceNumbers
 from biresnerf.refinement.verdict.judgement import _by_positions
 from biresnerf.refinement.views.compare_rigs import Rig
 from biresnerf.write.georeference import control_report
@@ -92,7 +93,7 @@ def judged(made, seed, relief_m, wrong):
     """The points, the poses of tracks alone, those that a run goes on with, and what the verdict says of these."""
     truth, points, tracks, alone = made(seed, relief_m)
     points = ControlPoints(**{**vars(points), "metres": wrong(points.metres.copy())})
-    control = measured_evidence(with_control(points), alone.world_from_cam, ALL).control
+    control = measured_evidence(with_control(points), alone.world_from_cam, ALL, EvidenceNumbers()).control
     found = adjusted(alone.world_from_cam, tracks, control=control)
     lenses = FREE.known(found.lenses.correction)
     if not control_believed(Evidence(GUESS, control=control), Cameras.of(found.world_from_cam, lenses)):

@@ -153,7 +153,7 @@ def test_a_field_without_surface_gives_no_patches(tmp_path, rng):
     run, _ = begun(tmp_path, rng)
     intrinsics = lenses(run.scene.dataset)
     renderer, options, placed = run.optimiser.renderer, run.optimiser.options, np.ones(VIEWS, np.bool_)
-    assert photo_patches(run.scene, renderer, options, intrinsics, intrinsics, placed) is None
+    assert photo_patches(run.scene, renderer, options, intrinsics, Evidence(intrinsics), placed) is None
 
 
 def test_a_lost_camera_is_placed_by_its_matches_and_adjusted_with_the_others(tmp_path, rng):

@@ -11,8 +11,11 @@ from biresnerf.geometry.similarity import Similarity, align_by_spread
 from biresnerf.refinement.adjustment.adjustment import adjust_poses
 from biresnerf.refinement.adjustment.evidence import Evidence, PosePrior
 from biresnerf.refinement.adjustment.lens.lenses import LENS, Lenses
-from biresnerf.refinement.finish.expected_errors import TRACK_MODEL_ERROR, bound_90, expected_errors
+from biresnerf.refinement.finish.expected_errors import bound_90, expected_errors
+from biresnerf.refinement.numbers.finish import EvidenceNumbers
 from tests.refinement.adjustment.rig import disturbed, observed, pinholes, ring
+
+TRACK_MODEL_ERROR = EvidenceNumbers().track_model_error
 
 CAMERAS = 9
 

@@ -9,13 +9,13 @@ from biresnerf.data.scene_kind import SceneKind
 from biresnerf.data.workload import FIRST_ROUND, LEARNING
 from biresnerf.forecast.run_forecast import RATES
 from biresnerf.refinement.finish.work_ahead import (
-    LEAST,
     budget_warnings,
     choose_steps,
     keep_to_budget,
     step_weights,
     work_ahead,
 )
+from biresnerf.refinement.optimise.methods import BIRESNERF
 from biresnerf.refinement.stages.checkpoint import load_checkpoint
 from biresnerf.refinement.stages.two_stages import MEASURED_STEPS
 from tests.refinement.tiny_scene import TinyRun, finished, given_scene, tiny_optimiser, tiny_options, tiny_set
@@ -53,7 +53,7 @@ def test_as_many_steps_are_taken_as_there_is_time_for(scene, tmp_path, seconds):
     run = with_step_of(begun(scene, tmp_path), 1.0)
     run.end_in(seconds)
     choose_steps(*run.parts, STEPS)
-    assert LEAST * STEPS < run.optimiser.schedule.steps < STEPS
+    assert BIRESNERF.finish.least_steps * STEPS < run.optimiser.schedule.steps < STEPS
     assert left_s(run) == pytest.approx(seconds, rel=0.02)
     options = run.optimiser.options
     assert options.coarse_steps_max == pytest.approx(options.steps / 2, abs=1)
@@ -66,7 +66,7 @@ def test_no_more_steps_are_taken_than_were_asked_for_and_no_fewer_than_a_tenth(s
     assert run.optimiser.schedule.steps == STEPS
     run.end_in(-1e6)
     choose_steps(*run.parts, STEPS)
-    assert run.optimiser.schedule.steps == round(LEAST * STEPS)
+    assert run.optimiser.schedule.steps == round(BIRESNERF.finish.least_steps * STEPS)
 
 
 def test_steps_that_were_too_few_are_added_again_where_they_turn_out_faster(scene, tmp_path):
@@ -123,7 +123,7 @@ def test_a_run_without_time_ends_early_and_says_what_it_took(scene, tmp_path):
     run = begun(scene, tmp_path, time_budget_s=0.01)
     keep_to_budget(*run.parts, time.monotonic(), STEPS)
     assert finished(run)
-    assert MEASURED_STEPS <= run.optimiser.step_index == round(LEAST * STEPS)
+    assert MEASURED_STEPS <= run.optimiser.step_index == round(BIRESNERF.finish.least_steps * STEPS)
     (warning,) = budget_warnings(run.optimiser.options.time_budget_s, run.state.record.seconds)
     assert "of a budget of 0.01 s" in warning
 

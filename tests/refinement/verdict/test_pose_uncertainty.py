@@ -8,13 +8,15 @@ import pytest
 from biresnerf.geometry.pose_error import pose_error
 from biresnerf.geometry.similarity import Similarity, align_by_spread
 from biresnerf.refinement.adjustment.cameras import Cameras
-from biresnerf.refinement.finish.expected_errors import TRACK_MODEL_ERROR
 from biresnerf.refinement.finish.outcome import Finish
+from biresnerf.refinement.numbers.finish import EvidenceNumbers
 from biresnerf.refinement.start.refined_poses import RefinedPoses
 from biresnerf.refinement.verdict.judgement import judge_poses
 from biresnerf.refinement.verdict.pose_uncertainty import MATCHES_CONTRADICT, NO_EVIDENCE, pose_uncertainty
 from tests.refinement.adjustment.rig import disturbed
 from tests.refinement.finish.test_adjust_cameras import VIEWS, adjusted, begun
+
+TRACK_MODEL_ERROR = EvidenceNumbers().track_model_error
 
 SCALE = 50.0  # of the caller's world
 CARRY = Similarity(SCALE, np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), np.array([7.0, -3, 100]))

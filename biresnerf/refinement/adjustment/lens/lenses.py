@@ -21,9 +21,6 @@ FOCAL, K1, K2, CENTRE, TANGENTIAL, ASPECT = 0, 1, 2, slice(3, 5), slice(5, 7), 7
 DISTORTION = [1, 2, 5, 6]  # k1, k2, p1, p2
 # In the order in which they are given up where the evidence does not tell of them, the last first, and freed.
 KINDS = ((0,), (3, 4), (1,), (2,), (5, 6), (7,))
-# A parameter is known from the evidence if its standard deviation there is less than this share of the one before: the
-# evidence then has eight ninths of the say.
-OBSERVABLE = 1 / 3
 RANK = 1e-13  # of the largest eigenvalue: what is smaller is rounding, or one of the motions of the whole rig
 ROUNDING = 1e-12  # of a lens's own information: what poses leave of it, if that is not more, is rounding
 NEWTON = 8
