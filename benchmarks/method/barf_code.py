@@ -24,6 +24,7 @@ from biresnerf.data.photos.images import load_images
 from biresnerf.field.radiance_field import PositionGradient
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.options.refine_options import parse_options
+from biresnerf.refinement.numbers.scene import FrameNumbers
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.scene.scene_frame import scene_frame
@@ -142,7 +143,7 @@ def main() -> None:
     dataset = read_dataset(asked.set)
     images = load_images(dataset, SIZE)
     noisy = perturb_poses(dataset.world_from_cam, NOISE, seed=1)
-    frame = scene_frame(noisy, images)
+    frame = scene_frame(noisy, images, FrameNumbers())
     options = parse_options({"preset": "fast", "method": "barf", "max_image_size": SIZE}).resolved("cpu")
     recipe = Recipe.of(options, torch.device("cpu"), 1)
     optimiser = JointOptimiser(images, frame, frame.unit_from_world.apply_to_poses(noisy), recipe, [])

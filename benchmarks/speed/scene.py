@@ -11,6 +11,7 @@ from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.synthetic.scene import render_synthetic, synthetic_cameras, synthetic_focal
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.options.refine_options import RefineOptions
+from biresnerf.refinement.numbers.scene import FrameNumbers
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.scene.scene_frame import scene_frame
@@ -48,7 +49,7 @@ def untrained(
     options = RefineOptions(preset=preset, device=device.type, max_image_size=size, steps=4 * STEPS)
     options = options.model_copy(update={"coarse_steps_max": 2 * STEPS}).resolved(device.type)
     photo_set, poses = photos(images, size), synthetic_cameras(VIEWS, SEED)[np.arange(images) % VIEWS]
-    frame = scene_frame(poses, photo_set)
+    frame = scene_frame(poses, photo_set, FrameNumbers())
     start = frame.unit_from_world.apply_to_poses(poses)
     return JointOptimiser(photo_set, frame, start, Recipe.of(options, device, threads), [])
 

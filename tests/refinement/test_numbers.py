@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import math
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
@@ -216,3 +217,21 @@ def test_photos_are_asked_about_motions_that_the_method_takes_for_seen(tiny, tmp
         run = TinyRun(optimiser(tiny, {"finish.unseen_px": unseen_px}), scene, tmp_path)
         asked.append(checks_ahead(*run.parts))
     assert asked == [True, False]
+
+
+def test_the_box_is_as_much_wider_than_what_photos_show_as_the_method_says(tiny):
+    frames = [optimiser(tiny, {"scene.content_margin": margin}).frame for margin in (0.4, 0.6)]
+    scales = [frame.unit_from_world.scale for frame in frames]
+    assert scales[0] / scales[1] == pytest.approx(1.5)
+
+
+def test_exposures_stay_within_the_methods_factor(tiny):
+    dataset, images = tiny
+    options = tiny_options(exposure="on")
+    run = tiny_optimiser(
+        dataset, images, options, [3], changed(BIRESNERF, {"parameters.exposure_most": 1.001})
+    )
+    for _ in range(4):
+        run.step()
+    logarithms = run.exposure.log_gain.detach().abs().max()
+    assert float(logarithms) == pytest.approx(math.log(1.001), rel=1e-4)

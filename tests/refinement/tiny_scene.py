@@ -78,9 +78,10 @@ def tiny_optimiser(
     held_out: list[int] | None = None,
     method: Method | None = None,
 ) -> JointOptimiser:
-    frame = scene_frame(dataset.world_from_cam, images)
+    recipe = Recipe.of(options, CPU, 2, method)
+    frame = scene_frame(dataset.world_from_cam, images, recipe.method.scene)
     start = frame.unit_from_world.apply_to_poses(dataset.world_from_cam)
-    return JointOptimiser(images, frame, start, Recipe.of(options, CPU, 2, method), held_out or [])
+    return JointOptimiser(images, frame, start, recipe, held_out or [])
 
 
 def given_scene(

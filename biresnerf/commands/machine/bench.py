@@ -77,9 +77,10 @@ def measured(options: RefineOptions, folder: Path, steps: int, views: int, size:
     dataset = read_dataset(write_synthetic_scene(folder, views, size, 1))
     images = load_images(dataset, size, resolved.background)
     poses = perturb_poses(dataset.world_from_cam, 0.05, 1)
-    frame = scene_frame(poses, images)
+    recipe = Recipe.of(resolved, device, threads)
+    frame = scene_frame(poses, images, recipe.method.scene)
     start = frame.unit_from_world.apply_to_poses(poses)
-    optimiser = JointOptimiser(images, frame, start, Recipe.of(resolved, device, threads), [])
+    optimiser = JointOptimiser(images, frame, start, recipe, [])
     stages = []
     for name in ("coarse", "fine"):
         if name == "fine":

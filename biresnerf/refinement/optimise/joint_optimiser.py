@@ -83,7 +83,7 @@ class JointOptimiser:
         behind = frame.background if frame.background is not None else seen.mean(0) / 255
         self.background = torch.as_tensor(behind, dtype=torch.float32, device=device)
         around = self.background if frame.background is not None else None
-        self.exposure = Exposure(images, options.exposure, held_out, around, device)
+        self.exposure = Exposure(images, options.exposure, held_out, around, device, self.method.parameters)
         self.step_index = 0
         # The step at which stage 2 began. A method of one stage is in its last from the first step.
         self.switch: int | None = None if self.method.two_stages else 0

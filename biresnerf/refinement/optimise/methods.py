@@ -22,6 +22,7 @@ from biresnerf.refinement.numbers.choosing import StartNumbers, VerdictNumbers, 
 from biresnerf.refinement.numbers.finish import EvidenceNumbers, FinishNumbers
 from biresnerf.refinement.numbers.lost import LostNumbers
 from biresnerf.refinement.numbers.optimise import ErrorNumbers, ScheduleNumbers, SwitchNumbers
+from biresnerf.refinement.numbers.scene import FrameNumbers, ParameterNumbers
 from biresnerf.refinement.optimise.schedule import Schedule
 from biresnerf.refinement.scene.scene_frame import SceneFrame
 
@@ -62,6 +63,7 @@ class Method:
             stage 2, of open scenes, and of lost cameras.
         start, views, verdict: numbers of the start, of unseen views, and of the verdict.
         evidence, finish: numbers of what all cameras are adjusted to, and of when that is done.
+        scene, parameters: numbers of the unit frame, and of what moves beside poses.
     """
 
     build_field: BuildField
@@ -94,6 +96,8 @@ class Method:
     verdict: VerdictNumbers = VerdictNumbers()
     evidence: EvidenceNumbers = EvidenceNumbers()
     finish: FinishNumbers = FinishNumbers()
+    scene: FrameNumbers = FrameNumbers()
+    parameters: ParameterNumbers = ParameterNumbers()
 
     def scheduled(self, options: ResolvedOptions, frame: SceneFrame) -> Schedule:
         """The schedule of a run in a scene."""

@@ -18,14 +18,7 @@ from biresnerf.data.photos.images import ImageSet
 from biresnerf.field.adam import Adam
 from biresnerf.field.radiance_field import Rendering
 from biresnerf.options.refine_options import ExposureChoice
-
-# Standard deviation of the photos' logarithmic brightness from which on `auto` compensates: photos with equal exposure
-# stay below (0.02 to 0.03 in fern, horns, lund_door), with nothing to gain.
-AUTO_FROM = 0.03
-RATE_SHARE = 1.0  # of the networks' learning rate
-PRIOR = 1e-4  # weight of the squared logarithms: photos without evidence stay like the others
-MOST = 3.0  # factor; a camera that does not see the scene would accept any
-SATURATED = 0.99  # a photo as bright as this may have been brighter
+from biresnerf.refinement.numbers.scene import ParameterNumbers
 
 
 def brightness_spread(images: ImageSet) -> float:
@@ -38,10 +31,10 @@ def brightness_spread(images: ImageSet) -> float:
     return float(np.std(means))
 
 
-def compensates(images: ImageSet, choice: ExposureChoice) -> bool:
+def compensates(images: ImageSet, choice: ExposureChoice, least_spread: float) -> bool:
     """Whether exposures are optimised: as requested; `auto` where opaque photos differ in brightness."""
     if choice == "auto":
-        return images.alpha is None and brightness_spread(images) >= AUTO_FROM
+        return images.alpha is None and brightness_spread(images) >= least_spread
     return choice == "on"
 
 
@@ -64,8 +57,10 @@ class Exposure:
         held_out: list[int],
         background: Tensor | None,
         device: torch.device,
+        numbers: ParameterNumbers = ParameterNumbers(),
     ) -> None:
-        self.on = compensates(images, choice)
+        self._numbers = numbers
+        self.on = compensates(images, choice, numbers.exposure_from)
         self.log_gain = torch.zeros(len(images), 3, device=device, requires_grad=self.on)
         self._background = background
         self._training = torch.ones(len(images), 1, device=device)
@@ -92,7 +87,8 @@ class Exposure:
             wanted = target.reshape(groups, -1, 3)
             share = torch.ones_like(colour) if weight is None else weight.reshape(groups, -1, 1)
             gain = (share * colour * wanted).sum(1) / (share * colour**2).sum(1).clamp(min=1e-6)
-            gain = gain.clamp(1 / MOST, MOST).repeat_interleave(colour.shape[1], 0)
+            most = self._numbers.exposure_most
+            gain = gain.clamp(1 / most, most).repeat_interleave(colour.shape[1], 0)
         return self._lit(rendering, gain)
 
     def _lit(self, rendering: Rendering, gain: Tensor) -> Tensor:
@@ -105,18 +101,19 @@ class Exposure:
         """`colour`, but the target where that is saturated and the colour brighter still, which is no error."""
         if not self.on:
             return colour
-        return torch.where((target >= SATURATED) & (colour > target), target, colour)
+        return torch.where((target >= self._numbers.saturated) & (colour > target), target, colour)
 
     @torch.no_grad()
     def step(self, rate: float) -> None:
         """One step of Adam from the gradients of the last backward; `rate` is the networks'."""
         if self.log_gain.grad is None:
             return
-        self.log_gain.grad += PRIOR / len(self.log_gain) * self.log_gain
-        self._adam.step(RATE_SHARE * rate)
+        self.log_gain.grad += self._numbers.exposure_prior / len(self.log_gain) * self.log_gain
+        self._adam.step(self._numbers.exposure_rate * rate)
         self.forget_gradients()
         mean = (self.log_gain * self._training).sum(0) / self._training.sum()
-        self.log_gain.sub_(mean).clamp_(-math.log(MOST), math.log(MOST))
+        most = math.log(self._numbers.exposure_most)
+        self.log_gain.sub_(mean).clamp_(-most, most)
 
     def forget_gradients(self) -> None:
         self._adam.zero_grad()

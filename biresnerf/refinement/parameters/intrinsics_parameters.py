@@ -15,6 +15,7 @@ from biresnerf.field.adam import Adam
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.options.refine_options import RefineIntrinsics
+from biresnerf.refinement.numbers.scene import ParameterNumbers
 from biresnerf.refinement.parameters.lens_increments import (
     ASPECT,
     COLUMNS,
@@ -29,10 +30,6 @@ from biresnerf.refinement.parameters.lens_increments import (
 from biresnerf.refinement.parameters.pose_parameters import dolly_directions
 
 BETAS, EPSILON = (0.9, 0.99), 1e-12
-# Expected standard deviations of the increments, and the weight of this prior in the loss: parameters without
-# evidence in the photos stay.
-DEVIATIONS = (0.2, 0.02, 0.05, 0.05, *(0.1,) * 11)
-PRIOR_WEIGHT = 1e-6
 
 
 def lenses_of(
@@ -41,6 +38,7 @@ def lenses_of(
     option: RefineIntrinsics,
     held_out: Sequence[int],
     device: torch.device,
+    numbers: ParameterNumbers = ParameterNumbers(),
     *,
     dollies: bool = True,
 ) -> IntrinsicsParameters:
@@ -52,6 +50,7 @@ def lenses_of(
         images.cameras,
         held_out,
         device,
+        numbers,
         dollies=dollies,
     )
 
@@ -104,6 +103,7 @@ class IntrinsicsParameters:
         working: Sequence[Camera],
         held_out: Sequence[int],
         device: torch.device,
+        numbers: ParameterNumbers = ParameterNumbers(),
         *,
         dollies: bool = True,
     ) -> None:
@@ -117,7 +117,8 @@ class IntrinsicsParameters:
         self.moving = bool(free.any())
         self.free = free.to(device)
         self.unit = torch.stack([units(camera) for camera in cameras]).to(device)
-        self.precision = PRIOR_WEIGHT / torch.tensor(DEVIATIONS, dtype=torch.float64, device=device) ** 2
+        deviations = torch.tensor(numbers.lens_deviations, dtype=torch.float64, device=device)
+        self.precision = numbers.lens_prior / deviations**2
         self.increments = torch.zeros(len(cameras), COLUMNS, dtype=torch.float64, device=device)
         self.increments.requires_grad_()
         self._adam = Adam([self.increments], betas=BETAS, eps=EPSILON)

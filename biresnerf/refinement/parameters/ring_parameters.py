@@ -10,8 +10,6 @@ from torch import Tensor
 from biresnerf.geometry.turntable import Ring
 from biresnerf.refinement.parameters.pose_parameters import PoseParameters
 
-SMOOTH_STEPS = 3.0  # mean steps between photos: the reach, as a standard deviation, of what moves one azimuth
-
 
 class RingParameters(PoseParameters):
     """Cameras that stay on one ring about the unit frame's z axis, at its elevation.
@@ -25,15 +23,16 @@ class RingParameters(PoseParameters):
         ring: where the increments start.
         distance: of the cameras, unit lengths.
         run: number of the run [n] that each photo belongs to.
+        reach: see `smoothing`.
     """
 
-    def __init__(self, ring: Ring, distance: float, run: Tensor, device: torch.device) -> None:
+    def __init__(self, ring: Ring, distance: float, run: Tensor, device: torch.device, reach: float) -> None:
         poses = torch.from_numpy(ring.matrices())
         poses[:, :3, 3] *= distance
         super().__init__(poses, distance, device)
         parts = (ring.azimuth, ring.elevation, ring.pan, ring.roll, ring.quarters)
         self.ring = Ring(*(part.float().to(device) for part in parts))
-        self.smoothing = smoothing(self.ring.azimuth, run.to(device))
+        self.smoothing = smoothing(self.ring.azimuth, run.to(device), reach)
 
     def matrices(self) -> Tensor:
         poses = self.now().poses()
@@ -50,9 +49,13 @@ class RingParameters(PoseParameters):
         )
 
 
-def smoothing(azimuth: Tensor, run: Tensor) -> Tensor:
-    """Weights [n, n], rows of sum one, with which what moves one camera moves those of its run near it."""
+def smoothing(azimuth: Tensor, run: Tensor, reach: float) -> Tensor:
+    """Weights [n, n], rows of sum one, with which what moves one camera moves those of its run near it.
+
+    Args:
+        reach: of their standard deviation, in mean steps between photos.
+    """
     apart = torch.remainder(azimuth[:, None] - azimuth[None] + torch.pi, 2 * torch.pi) - torch.pi
-    reach = SMOOTH_STEPS * 2 * torch.pi / len(azimuth)
-    near = torch.exp(-0.5 * (apart / reach) ** 2) * (run[:, None] == run[None])
+    deviation = reach * 2 * torch.pi / len(azimuth)
+    near = torch.exp(-0.5 * (apart / deviation) ** 2) * (run[:, None] == run[None])
     return near / near.sum(1, keepdim=True)

@@ -10,10 +10,7 @@ from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam
 from biresnerf.geometry.epipolar import epipolar_angles, match_depths
-
-AGREE_DEG = 1.0  # a pair whose epipolar error is larger is not used: either it or the poses are wrong
-LEAST_PARALLAX_DEG = 1.0  # between the rays of a pair; below, noise makes the depth
-LEAST_PAIRS = 30  # of observations of one point
+from biresnerf.refinement.numbers.scene import FrameNumbers
 
 
 def track_rays(intrinsics: Intrinsics, tracks: Tracks) -> NDArray[np.float64]:
@@ -28,7 +25,7 @@ def track_rays(intrinsics: Intrinsics, tracks: Tracks) -> NDArray[np.float64]:
 
 
 def matched_depth(
-    dataset: Dataset, world_from_cam: NDArray[np.float64], tracks: Tracks | None
+    dataset: Dataset, world_from_cam: NDArray[np.float64], tracks: Tracks | None, numbers: FrameNumbers
 ) -> float | None:
     """Median depth of tracked points in front of the cameras at poses [n, 4, 4], in their unit.
 
@@ -46,5 +43,5 @@ def matched_depth(
         np.arctan2(np.linalg.norm(np.cross(world_a, world_b), axis=1), (world_a * world_b).sum(1))
     )
     depths = match_depths(world_from_cam, a, b, ray_a, ray_b)
-    usable = (errors < AGREE_DEG) & (parallax > LEAST_PARALLAX_DEG) & (depths > 0).all(1)
-    return float(np.median(depths[usable])) if usable.sum() >= LEAST_PAIRS else None
+    usable = (errors < numbers.agree_deg) & (parallax > numbers.pair_parallax_deg) & (depths > 0).all(1)
+    return float(np.median(depths[usable])) if usable.sum() >= numbers.pairs else None

@@ -19,17 +19,13 @@ from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.focus import focus_point, rms_spread
 from biresnerf.geometry.similarity import Similarity
+from biresnerf.refinement.numbers.scene import FrameNumbers
 from biresnerf.refinement.scene.shared_views import nearest_shared
 
 logger = logging.getLogger(__name__)
 
-# Below this mean squared sine the axes are too parallel to say where they meet (a spread of about 6 degrees).
-CONVERGING = 0.01
-FORWARD_FACING_DEPTH = 6.0  # in spreads of the camera centres, where nothing better is known
-CONTENT_MARGIN = 1.15  # the box of what photos show is widened by this
 # Half an angle of view counts as no more than this tangent (56 deg): fisheyes see to their sides.
 WIDEST_SLOPE = 1.5
-FAR_BOXES = 60.0  # unbounded rays end this many inner boxes away (contracted to 1.98 of 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +94,9 @@ def _pixel_slope(images: ImageSet) -> float:
     return float(np.median(spans) / np.median([max(c.width, c.height) for c in images.cameras]))
 
 
-def scene_frame(poses: np.ndarray, images: ImageSet, depth: float | None = None) -> SceneFrame:
+def scene_frame(
+    poses: np.ndarray, images: ImageSet, numbers: FrameNumbers, depth: float | None = None
+) -> SceneFrame:
     """The unit frame of a set, from its poses world_from_cam [n, 4, 4] (noisy ones will do) and images.
 
     Several sets of poses of the same images, one after the other, get a frame that suits them all. Where the optical
@@ -107,32 +105,32 @@ def scene_frame(poses: np.ndarray, images: ImageSet, depth: float | None = None)
     centres = poses[:, :3, 3]
     focus = focus_point(poses)
     centre, distance = focus.point, focus.mean_distance
-    if focus.conditioning < CONVERGING or focus.in_front < 0.5:
+    if focus.conditioning < numbers.converging or focus.in_front < 0.5:
         spread = rms_spread(centres)
         axis = poses[:, :3, 2].mean(0)
         length = float(np.linalg.norm(axis))
         forward = axis / length if length > 0.2 else np.zeros(3)
-        guess = FORWARD_FACING_DEPTH * spread if spread > 0 else 1.0
+        guess = numbers.forward_facing_depth * spread if spread > 0 else 1.0
         distance = guess if depth is None else depth
         centre = centres.mean(0) + distance * forward
         logger.info("optical axes do not meet: taking the scene %.3g ahead of the cameras", distance)
     half = distance * _half_angle_tangent(images)
     reach = _content_reach(poses, images, centre)
     if reach is not None:
-        half = min(half, CONTENT_MARGIN * reach)
+        half = min(half, numbers.content_margin * reach)
     unit_from_world = Similarity(1 / half, np.eye(3), -centre / half)
     return SceneFrame(
         unit_from_world=unit_from_world,
         unbounded=images.background is None,
         distance=distance / half,
         pixel=_pixel_slope(images) * distance / half,
-        far=FAR_BOXES if images.background is None else 4 * distance / half + 4,
+        far=numbers.far_boxes if images.background is None else 4 * distance / half + 4,
         background=images.background,
-        near=_near(poses, images, distance) if images.background is None else 0.0,
+        near=_near(poses, images, distance, numbers) if images.background is None else 0.0,
     )
 
 
-def _near(poses: np.ndarray, images: ImageSet, distance: float) -> float:
+def _near(poses: np.ndarray, images: ImageSet, distance: float, numbers: FrameNumbers) -> float:
     intrinsics = Intrinsics.from_cameras(images.cameras)
     rigs = poses.reshape(-1, len(images), 4, 4)
-    return min(nearest_shared(rig, intrinsics, distance) for rig in rigs)
+    return min(nearest_shared(rig, intrinsics, distance, numbers) for rig in rigs)

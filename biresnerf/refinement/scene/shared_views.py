@@ -15,21 +15,20 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam, in_view
+from biresnerf.refinement.numbers.scene import FrameNumbers
 
 WITNESSES = 2  # other cameras that must have a point in view
-# Sampling begins where this share of what cameras see is seen by witnesses that look less than a right angle
-# elsewhere: cameras across the scene do not help, as the scene lies between.
-WITNESSED = 0.8
-# Distances tried, as shares of the cameras' distance. Noisy poses share less: beyond 0.5 scenes may begin.
-NEAREST, FARTHEST, SPACING = 0.1, 0.5, 0.05
+SPACING = 0.05  # of the distances tried, as a share of the cameras' distance
 SEERS, SIDE = 24, 5  # cameras tried, and pixels of each along either side
 ASKED_AT_ONCE = 64  # cameras, which settle most points where the set is large
 
 
-def nearest_shared(unit_from_cam: NDArray[np.float64], intrinsics: Intrinsics, distance: float) -> float:
-    """The share of ``distance`` from which on `WITNESSED` of what cameras see is seen by two others.
+def nearest_shared(
+    unit_from_cam: NDArray[np.float64], intrinsics: Intrinsics, distance: float, numbers: FrameNumbers
+) -> float:
+    """The share of ``distance`` from which on enough of what cameras see is seen by two others.
 
-    `NEAREST` where no distance reaches that: a set that shares so little needs all it has.
+    The least where no distance reaches that: a set that shares so little needs all it has.
 
     Args:
         unit_from_cam: [n, 4, 4]; noisy ones will do.
@@ -40,7 +39,7 @@ def nearest_shared(unit_from_cam: NDArray[np.float64], intrinsics: Intrinsics, d
     seers = torch.linspace(0, len(matrices) - 1, min(SEERS, len(matrices))).round().long()
     along = (torch.arange(SIDE, dtype=torch.float64) + 0.5) / SIDE
     grid = torch.stack(torch.meshgrid(along, along, indexing="xy"), -1).reshape(-1, 2)
-    shares = np.arange(NEAREST, FARTHEST + SPACING / 2, SPACING)
+    shares = np.arange(numbers.nearest, numbers.farthest + SPACING / 2, SPACING)
     witnessed = np.zeros(len(shares))
     for seer in seers.tolist():
         size = torch.stack([intrinsics.width[seer], intrinsics.height[seer]]).to(grid)
@@ -53,8 +52,8 @@ def nearest_shared(unit_from_cam: NDArray[np.float64], intrinsics: Intrinsics, d
         others = torch.nonzero(facing)[:, 0]
         enough = _seen_by(others, points.reshape(-1, 3), matrices, intrinsics).sum(0) >= WITNESSES
         witnessed += enough.numpy().reshape(len(shares), -1).mean(1)
-    reached = np.flatnonzero(witnessed / len(seers) >= WITNESSED)
-    return float(shares[reached[0]]) if len(reached) else NEAREST
+    reached = np.flatnonzero(witnessed / len(seers) >= numbers.witnessed)
+    return float(shares[reached[0]]) if len(reached) else numbers.nearest
 
 
 def shared_shares(points: Tensor, seer: Tensor, unit_from_cam: Tensor, intrinsics: Intrinsics) -> Tensor:

@@ -24,12 +24,16 @@ def first_step(scene: Scene, recipe: Recipe) -> JointOptimiser:
     dataset, images, start, options = scene.dataset, scene.images, scene.start, recipe.options
     bodies = rigid_bodies(dataset, options)
     world_from_cam = bodies.held(start.world_from_cam, dataset.world_from_cam)
-    frame = scene_frame(world_from_cam, images, matched_depth(dataset, world_from_cam, scene.tracks))
+    numbers = recipe.method.scene
+    depth = matched_depth(dataset, world_from_cam, scene.tracks, numbers)
+    frame = scene_frame(world_from_cam, images, numbers, depth)
     poses = frame.unit_from_world.apply_to_poses(world_from_cam)
     excluded = scene.excluded_from_training
     adjusted = scene.tracks is not None and adjusts_cameras(dataset, recipe.method)
     by_photos = "none" if adjusted else options.refine_intrinsics
-    lenses = lenses_of(dataset, images, by_photos, excluded, recipe.device, dollies=not bodies.tied)
+    lenses = lenses_of(
+        dataset, images, by_photos, excluded, recipe.device, recipe.method.parameters, dollies=not bodies.tied
+    )
     optimiser = JointOptimiser(images, frame, poses, recipe, excluded, pose_mobility(start), bodies, lenses)
     optimiser.camera_errors.doubt(start.guessed)
     return optimiser

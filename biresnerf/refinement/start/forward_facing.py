@@ -43,7 +43,7 @@ def find_forward_facing(
         InputError: ``insufficient_overlap``: no poses were found that predict unseen photos.
         Interrupted: ``should_stop`` returned true.
     """
-    frame = scene_frame(np.tile(np.eye(4), (len(images), 1, 1)), images)
+    frame = scene_frame(np.tile(np.eye(4), (len(images), 1, 1)), images, recipe.method.scene)
     numbers, unseen = recipe.method.start, trial_views(len(images), recipe.method.views)
 
     def run(world_from_cam: NDArray[np.float64], steps: int) -> tuple[NDArray[np.float64], float]:

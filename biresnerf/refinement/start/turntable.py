@@ -66,7 +66,7 @@ class RingTrials:
         pixels = int(sum(images.widths[v] * images.heights[v] for v in self.unseen))
         self._stride = max(1, math.ceil(math.sqrt(pixels / recipe.method.start.ring_unseen_rays)))
         even = torch.arange(len(images)) * (2 * torch.pi / len(images))
-        self.frame = scene_frame(Ring.level(even).matrices(), images)
+        self.frame = scene_frame(Ring.level(even).matrices(), images, recipe.method.scene)
 
     def run(self, ring: Ring) -> Tried:
         """Optimise a ring and a field; unseen photos move the ring, but do not train the field.
@@ -78,7 +78,8 @@ class RingTrials:
         steps = numbers.ring_steps
         short = self._recipe.apart(steps, (steps // 4, 2 * steps), numbers.ring_samples)
         poses = self.frame.unit_from_world.apply_to_poses(ring.matrices())
-        moving = RingParameters(ring, self.frame.distance, self._run, self._recipe.device)
+        reach = self._recipe.method.parameters.ring_reach
+        moving = RingParameters(ring, self.frame.distance, self._run, self._recipe.device, reach)
         optimiser = JointOptimiser(
             self.images, self.frame, poses, short, self.unseen, sampler=self._sampler, poses=moving
         )

@@ -69,7 +69,7 @@ class PoseTrials:
         sampler: PhotoSampler | None = None,
     ) -> None:
         self.images, self.unseen = images, list(unseen)
-        self.frame = scene_frame(np.concatenate(list(rigs)), images)
+        self.frame = scene_frame(np.concatenate(list(rigs)), images, recipe.method.scene)
         self.kind = recipe.method.kinds.of(self.frame.unbounded)
         self.steps = steps * self.kind.trial_steps
         # All of it stage 1, and the rates fall to their end: with the rates of a longer run's first half, trainings on

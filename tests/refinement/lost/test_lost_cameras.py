@@ -17,6 +17,7 @@ from biresnerf.geometry.similarity import align_robust
 from biresnerf.progress import Monitor
 from biresnerf.refinement.finish.outcome import Finish
 from biresnerf.refinement.lost import lost_cameras
+from biresnerf.refinement.numbers.scene import FrameNumbers
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.method_changes import changed
 from biresnerf.refinement.optimise.methods import BIRESNERF, Method, Recipe
@@ -52,7 +53,7 @@ def scene(tmp_path_factory) -> tuple[Dataset, ImageSet]:
 
 
 def true_poses(scene: tuple[Dataset, ImageSet]) -> np.ndarray:
-    return scene_frame(scene[0].world_from_cam, scene[1]).unit_from_world.apply_to_poses(
+    return scene_frame(scene[0].world_from_cam, scene[1], FrameNumbers()).unit_from_world.apply_to_poses(
         scene[0].world_from_cam
     )
 
@@ -75,7 +76,7 @@ def start(
     )
     optimiser = JointOptimiser(
         scene[1],
-        scene_frame(scene[0].world_from_cam, scene[1]),
+        scene_frame(scene[0].world_from_cam, scene[1], FrameNumbers()),
         poses,
         Recipe.of(options, CPU, 1, method),
         HELD_OUT,

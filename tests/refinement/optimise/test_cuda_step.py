@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from biresnerf.refinement.numbers.scene import FrameNumbers
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.scene.scene_frame import scene_frame
@@ -16,7 +17,7 @@ from tests.refinement.tiny_scene import tiny_options, tiny_set
 )
 def test_a_step_waits_for_nothing_and_the_error_falls(tmp_path):
     dataset, images = tiny_set(tmp_path)
-    frame = scene_frame(dataset.world_from_cam, images)
+    frame = scene_frame(dataset.world_from_cam, images, FrameNumbers())
     start = frame.unit_from_world.apply_to_poses(dataset.world_from_cam)
     options = tiny_options(device="cuda", steps=400, coarse_steps_max=200)
     optimiser = JointOptimiser(images, frame, start, Recipe.of(options, torch.device("cuda"), 1), [1])

@@ -8,6 +8,7 @@ import torch
 
 from benchmarks.gpu.launches import traced_step
 from biresnerf.geometry.rigid_bodies import RigidBodies
+from biresnerf.refinement.numbers.scene import FrameNumbers
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.parameters.intrinsics_parameters import lenses_of
@@ -26,7 +27,7 @@ def tiny(tmp_path_factory):
 def trained(tiny, *, stage: int = 1, bodies: RigidBodies | None = None, **options) -> JointOptimiser:
     """After three steps of a stage."""
     dataset, images = tiny
-    frame = scene_frame(dataset.world_from_cam, images)
+    frame = scene_frame(dataset.world_from_cam, images, FrameNumbers())
     start = frame.unit_from_world.apply_to_poses(dataset.world_from_cam)
     chosen = tiny_options(**options)
     lenses = lenses_of(dataset, images, chosen.refine_intrinsics, HELD_OUT, CPU)

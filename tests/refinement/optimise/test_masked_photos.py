@@ -10,6 +10,7 @@ import torch
 
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.refinement.lost.lost_cameras import LostCameraRepair
+from biresnerf.refinement.numbers.scene import FrameNumbers
 from biresnerf.refinement.optimise.camera_errors import CameraErrors, foreground_shares
 from biresnerf.refinement.optimise.method_changes import changed
 from biresnerf.refinement.optimise.methods import BIRESNERF
@@ -104,8 +105,8 @@ def test_measures_of_photos_do_not_depend_on_what_is_masked(spoilt_twice):
     ):
         np.testing.assert_allclose(measure(one), measure(other), atol=1e-6)
     assert (
-        scene_frame(dataset.world_from_cam, one).distance
-        == scene_frame(dataset.world_from_cam, other).distance
+        scene_frame(dataset.world_from_cam, one, FrameNumbers()).distance
+        == scene_frame(dataset.world_from_cam, other, FrameNumbers()).distance
     )
 
 

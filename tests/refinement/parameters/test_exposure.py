@@ -13,7 +13,8 @@ from biresnerf.data.photos.images import ImageSet
 from biresnerf.field.radiance_field import Rendering
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_by_spread
-from biresnerf.refinement.parameters.exposure import MOST, Exposure, brightness_spread, compensates
+from biresnerf.refinement.numbers.scene import ParameterNumbers
+from biresnerf.refinement.parameters.exposure import Exposure, brightness_spread, compensates
 from tests.refinement.tiny_scene import CPU, photos_set, tiny_optimiser, tiny_options, tiny_set
 
 pytestmark = pytest.mark.slow
@@ -127,7 +128,7 @@ def test_factors_of_training_photos_have_mean_one_and_none_runs_away():
     gains = exposure.gains()
     assert np.log(gains[:3]).mean() == pytest.approx(0, abs=1e-5)
     assert gains[2, 0] > 1.3 * gains[1, 0] > 1.6 * gains[0, 0]
-    assert gains[3, 0] == pytest.approx(MOST)
+    assert gains[3, 0] == pytest.approx(ParameterNumbers().exposure_most)
 
 
 def test_factors_for_a_pose_that_is_tried_are_its_own():
@@ -148,11 +149,11 @@ def test_auto_compensates_opaque_photos_that_differ_in_brightness():
     dim = photos_set(list(noise.astype(np.uint8)))
     even = photos_set([noise[0].astype(np.uint8)] * 3)
     assert brightness_spread(dim) == pytest.approx(np.std(np.log([1, 0.9, 0.8])), abs=0.02)
-    assert compensates(dim, "auto")
-    assert not compensates(even, "auto")
-    assert not compensates(dim, "none")
-    assert compensates(even, "on")
-    assert not compensates(replace(dim, alpha=np.full(1200, 200, np.uint8)), "auto")
+    assert compensates(dim, "auto", 0.03)
+    assert not compensates(even, "auto", 0.03)
+    assert not compensates(dim, "none", 0.03)
+    assert compensates(even, "on", 0.03)
+    assert not compensates(replace(dim, alpha=np.full(1200, 200, np.uint8)), "auto", 0.03)
 
 
 def test_a_checkpoint_keeps_factors_and_momentum():

@@ -15,6 +15,7 @@ from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.synthetic.scene import render_synthetic, synthetic_cameras, synthetic_focal
 from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam
 from biresnerf.geometry.camera.camera_models import FAMILY_MODELS, MODEL_PARAMETERS, Camera
+from biresnerf.refinement.numbers.scene import FrameNumbers
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.optimise.renderer import turned, viewing_directions
@@ -253,7 +254,7 @@ def with_lenses(scene, options, factor: float, part: str, *, dollies: bool = Tru
     wrong = replace(true, params=(true.params[0] * factor, *true.params[1:]))
     images = replace(images, cameras=(wrong,) * len(poses))
     lenses = IntrinsicsParameters([wrong], [0] * len(poses), [part], images.cameras, [], CPU, dollies=dollies)
-    frame = scene_frame(poses, images)
+    frame = scene_frame(poses, images, FrameNumbers())
     start = frame.unit_from_world.apply_to_poses(poses)
     return JointOptimiser(images, frame, start, Recipe.of(options, CPU, 2), [], lenses=lenses)
 

@@ -18,7 +18,7 @@ def start() -> Ring:
 
 
 def parameters() -> RingParameters:
-    return RingParameters(start(), DISTANCE, RUN, torch.device("cpu"))
+    return RingParameters(start(), DISTANCE, RUN, torch.device("cpu"), 3.0)
 
 
 def test_without_increments_cameras_are_where_the_ring_puts_them():
@@ -42,7 +42,7 @@ def test_a_step_of_adam_moves_shared_angles_by_the_rate_and_azimuths_with_their_
 
 
 def test_weights_of_neighbours_sum_to_one_and_fall_with_their_distance_round_the_ring():
-    weights = smoothing(torch.arange(30) * (2 * torch.pi / 30), torch.zeros(30)).numpy()
+    weights = smoothing(torch.arange(30) * (2 * torch.pi / 30), torch.zeros(30), 3.0).numpy()
     np.testing.assert_allclose(weights.sum(1), 1, rtol=1e-6)
     np.testing.assert_allclose(weights[0, 1], weights[0, 29], rtol=1e-5)
     np.testing.assert_allclose(weights[0, 3] / weights[0, 0], np.exp(-0.5), rtol=1e-5)

@@ -13,9 +13,12 @@ from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.similarity import Similarity
+from biresnerf.refinement.numbers.scene import FrameNumbers
 from biresnerf.refinement.scene.scene_depth import matched_depth
 from biresnerf.refinement.scene.scene_frame import scene_frame
 from tests.refinement.tiny_scene import tiny_set
+
+FRAME = FrameNumbers()
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +35,9 @@ def moved(dataset, similarity: Similarity):
 
 
 def unit_poses(dataset, images):
-    return scene_frame(dataset.world_from_cam, images).unit_from_world.apply_to_poses(dataset.world_from_cam)
+    return scene_frame(dataset.world_from_cam, images, FRAME).unit_from_world.apply_to_poses(
+        dataset.world_from_cam
+    )
 
 
 @pytest.mark.parametrize(("scale", "shift"), [(1e-3, 0.0), (250.0, 1e4), (1.0, -70.0)])
@@ -40,7 +45,10 @@ def test_scale_and_origin_of_the_input_do_not_matter(scene, scale, shift):
     dataset, images = scene
     other = moved(dataset, Similarity(scale, np.eye(3), np.array([shift, -shift, 0.5 * shift])))
     np.testing.assert_allclose(unit_poses(other, images), unit_poses(dataset, images), atol=1e-6)
-    one, two = scene_frame(dataset.world_from_cam, images), scene_frame(other.world_from_cam, images)
+    one, two = (
+        scene_frame(dataset.world_from_cam, images, FRAME),
+        scene_frame(other.world_from_cam, images, FRAME),
+    )
     for name in ("distance", "pixel", "far", "unbounded"):
         assert getattr(two, name) == pytest.approx(getattr(one, name), rel=1e-6)
 
@@ -55,7 +63,7 @@ def test_the_axes_of_the_input_only_turn_the_unit_frame(scene):
 
 def test_the_scene_lies_in_the_box_and_the_cameras_outside_looking_in(scene):
     dataset, images = scene
-    frame = scene_frame(dataset.world_from_cam, images)
+    frame = scene_frame(dataset.world_from_cam, images, FRAME)
     # The synthetic scene reaches from -0.8 to 0.9 about the origin.
     corners = np.array([[x, y, z] for x in (-0.7, 0.7) for y in (-0.7, 0.7) for z in (-0.5, 0.8)])
     assert np.abs(frame.unit_from_world.apply(corners)).max() < 1.0
@@ -69,7 +77,7 @@ def test_the_scene_lies_in_the_box_and_the_cameras_outside_looking_in(scene):
 
 def test_a_pixel_is_as_wide_as_two_neighbouring_rays_are_apart_at_the_centre(scene):
     dataset, images = scene
-    frame = scene_frame(dataset.world_from_cam, images)
+    frame = scene_frame(dataset.world_from_cam, images, FRAME)
     fx = images.cameras[0].full().fx
     assert frame.pixel == pytest.approx(frame.distance / fx, rel=1e-6)
 
@@ -81,7 +89,7 @@ def test_the_lens_decides_how_far_the_box_reaches(scene):
 
     def half(camera: Camera) -> float:
         bent = replace(images, cameras=(camera,) * len(dataset))
-        return 1 / scene_frame(dataset.world_from_cam, bent).unit_from_world.scale
+        return 1 / scene_frame(dataset.world_from_cam, bent, FRAME).unit_from_world.scale
 
     w = images.cameras[0].width
     tangents = {
@@ -97,7 +105,7 @@ def test_the_lens_decides_how_far_the_box_reaches(scene):
 
 def test_photos_that_show_surroundings_make_an_unbounded_frame(scene):
     dataset, images = scene
-    frame = scene_frame(dataset.world_from_cam, replace(images, background=None, alpha=None))
+    frame = scene_frame(dataset.world_from_cam, replace(images, background=None, alpha=None), FRAME)
     assert frame.unbounded
     assert frame.background is None
     assert frame.far > 10 * frame.distance
@@ -110,7 +118,7 @@ def test_parallel_cameras_see_the_scene_ahead_of_them(scene):
     rows[:, :3, 3] = rows[:, :3, 0] * np.arange(len(dataset))[:, None] + [4.0, 5.0, 6.0]
     frames = tuple(replace(f, world_from_cam=p) for f, p in zip(dataset.frames, rows, strict=True))
     parallel = replace(dataset, frames=frames)
-    centre = scene_frame(parallel.world_from_cam, images).unit_from_world.inverse().apply(np.zeros(3))
+    centre = scene_frame(parallel.world_from_cam, images, FRAME).unit_from_world.inverse().apply(np.zeros(3))
     in_cam = (centre - rows[:, :3, 3]) @ rows[0, :3, :3]
     assert (in_cam[:, 2] > 0).all()
     assert in_cam[:, 2].min() > np.ptp(rows[:, :3, 3], axis=0).max() / 2
@@ -129,9 +137,9 @@ def test_where_axes_do_not_meet_matches_tell_how_far_the_scene_is(scene):
     full = dataset.cameras[0].width / images.cameras[0].width
     seen = [focal * (points[:, :2] - rows[i, :2, 3]) / points[:, 2:] + [cx, cy] for i in (0, n - 1)]
     matches = Tracks.of_matches(np.stack([a, b], axis=1), full * np.stack(seen, axis=1))
-    depth = matched_depth(dataset, rows, matches)
+    depth = matched_depth(dataset, rows, matches, FRAME)
     assert depth == pytest.approx(np.median(points[:, 2]), rel=0.02)
-    frame = scene_frame(rows, images, depth)
+    frame = scene_frame(rows, images, FRAME, depth)
     assert frame.distance / frame.unit_from_world.scale == pytest.approx(depth)
     centre = frame.unit_from_world.inverse().apply(np.zeros(3))
     np.testing.assert_allclose(centre, [0, 0, depth], atol=1e-6)
@@ -142,14 +150,14 @@ def test_matches_that_contradict_the_poses_tell_no_depth(scene):
     rng = np.random.default_rng(1)
     pairs = np.stack([np.zeros(100, dtype=np.int64), np.ones(100, dtype=np.int64)], axis=1)
     few = Tracks.of_matches(pairs[:20], rng.uniform(0, dataset.cameras[0].width, (20, 2, 2)))
-    assert matched_depth(dataset, dataset.world_from_cam, few) is None
-    assert matched_depth(dataset, dataset.world_from_cam, None) is None
+    assert matched_depth(dataset, dataset.world_from_cam, few, FRAME) is None
+    assert matched_depth(dataset, dataset.world_from_cam, None, FRAME) is None
 
 
 def test_cameras_all_in_one_place_still_give_a_frame(scene):
     dataset, images = scene
     frames = tuple(replace(f, world_from_cam=dataset.frames[0].world_from_cam) for f in dataset.frames)
-    frame = scene_frame(replace(dataset, frames=frames).world_from_cam, images)
+    frame = scene_frame(replace(dataset, frames=frames).world_from_cam, images, FRAME)
     assert np.isfinite(frame.distance)
     assert frame.unit_from_world.scale > 0
 
@@ -180,7 +188,7 @@ def test_a_small_thing_before_black_fills_the_box_also_where_poses_are_noisy(noi
         *(None, np.arange(n + 1) * side * side, size, size, (camera,) * n, np.zeros(3, dtype=np.float32)),
     )
     noisy = perturb_poses(poses, noise, seed=1)
-    unit_from_world = scene_frame(noisy, images).unit_from_world
+    unit_from_world = scene_frame(noisy, images, FRAME).unit_from_world
     reached = np.abs(unit_from_world.apply(corners)).max()
     assert {0.0: 0.4, 0.15: 0.2, 0.35: 0.1}[noise] < reached < 1
     # The thing is in the middle of each photo: nearly all cameras, as they are given, see it within the box.

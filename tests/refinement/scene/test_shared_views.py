@@ -11,16 +11,17 @@ import torch
 from biresnerf.data.synthetic.scene import synthetic_cameras
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.camera.camera_models import Camera
+from biresnerf.refinement.numbers.scene import FrameNumbers
 from biresnerf.refinement.scene.scene_frame import scene_frame
 from biresnerf.refinement.scene.shared_views import (
     ASKED_AT_ONCE,
-    FARTHEST,
-    NEAREST,
     SPACING,
     nearest_shared,
     shared_shares,
 )
 from tests.refinement.tiny_scene import tiny_optimiser, tiny_options, tiny_set
+
+FRAME = FrameNumbers()
 
 LENS = Camera("SIMPLE_PINHOLE", 20, 20, (20.0, 10.0, 10.0))  # half a unit to each side at a distance of one
 
@@ -91,12 +92,12 @@ def arc(count: int, apart_deg: float, distance: float = 5.0) -> np.ndarray:
 
 def near_of(poses: np.ndarray, distance: float = 5.0) -> float:
     camera = Camera("SIMPLE_PINHOLE", 20, 20, (20.0, 10.0, 10.0))
-    return nearest_shared(poses, Intrinsics.from_cameras([camera] * len(poses)), distance)
+    return nearest_shared(poses, Intrinsics.from_cameras([camera] * len(poses)), distance, FRAME)
 
 
 def test_cameras_closer_together_may_see_nearer_things():
     nears = [near_of(arc(12, apart)) for apart in (1, 4, 7)]
-    assert nears[0] == pytest.approx(NEAREST)
+    assert nears[0] == pytest.approx(FRAME.nearest)
     assert nears == sorted(nears)
     assert nears[2] > nears[0]
 
@@ -128,23 +129,23 @@ def test_scale_and_place_do_not_matter():
 
 
 def test_a_set_that_shares_little_is_sampled_from_as_near_as_ever():
-    assert near_of(arc(6, 60)) == NEAREST  # all around: only cameras across the scene look there
+    assert near_of(arc(6, 60)) == FRAME.nearest  # all around: only cameras across the scene look there
 
 
 def test_noise_never_moves_it_beyond_its_bound():
     rng = np.random.default_rng(0)
     poses = arc(12, 6)
     poses[:, :3, 3] += rng.normal(0, 1.0, (12, 3))
-    assert NEAREST <= near_of(poses) <= FARTHEST
+    assert FRAME.nearest <= near_of(poses) <= FRAME.farthest
 
 
 def test_open_scenes_are_sampled_from_there_on_and_others_as_before(tmp_path):
     dataset, images = tiny_set(tmp_path)
-    assert scene_frame(dataset.world_from_cam, images).near == 0.0
+    assert scene_frame(dataset.world_from_cam, images, FRAME).near == 0.0
     opened = replace(images, alpha=None, background=None)
     optimiser = tiny_optimiser(dataset, opened, tiny_options())
     optimiser.frame = replace(optimiser.frame, near=0.45)
     optimiser.step_index, optimiser.switch = 39, 20
     assert optimiser.marching(0.01).near == pytest.approx(0.45 * optimiser.frame.distance)
-    both = scene_frame(np.concatenate([dataset.world_from_cam] * 2), opened)
-    assert both.near == scene_frame(dataset.world_from_cam, opened).near
+    both = scene_frame(np.concatenate([dataset.world_from_cam] * 2), opened, FRAME)
+    assert both.near == scene_frame(dataset.world_from_cam, opened, FRAME).near
