@@ -13,7 +13,9 @@ from typing import Any
 import pytest
 import torch
 
+from biresnerf.commands.settings_option import parse_settings
 from biresnerf.data.seeding.initial_poses import InitialPoses
+from biresnerf.errors import InputError
 from biresnerf.field.radiance_field import Merging
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.judging.compare import Rule
@@ -91,6 +93,16 @@ def test_a_run_names_the_numbers_that_it_changed_and_no_others():
         "course.freeze_share": "0.5",
         "kinds.open.facing_forward.least": "0.2",
     }
+
+
+def test_a_comparison_changes_numbers_as_it_sets_options():
+    asked = parse_settings(("kinds.open.repairs=[0.25,1]", "lost.rounds=[[2,24,3]]", "finish.slack=0"))
+    method = changed(BIRESNERF, asked)
+    assert method.kinds.open.repairs == (0.25, 1.0)
+    assert method.lost.rounds == ((2, 24, 3),)
+    assert method.finish.slack == 0
+    with pytest.raises(InputError, match="number"):
+        changed(BIRESNERF, parse_settings(("lost.distinct_deg=far",)))
 
 
 @pytest.fixture(scope="module")
