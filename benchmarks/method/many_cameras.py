@@ -1,76 +1,155 @@
-"""How long the adjustment of many cameras takes: ``python -m benchmarks.method.many_cameras 250 500 1000``.
+"""How long the adjustment of many cameras takes, and what it reaches: ``python -m benchmarks.method.many_cameras``.
 
-Cameras stand on a dome and look at points within it; each point is seen by six of them, half a pixel off. The poses to
-start from are a tenth of a degree off. Prints a row for each number of cameras: unknowns, seconds, the mean rotation
-error before and after, and the largest memory so far.
+``--shapes ring corridor aerial --counts 100 300 1000 3000 --by sparse dense ceres``: the rigs of `camera_rigs`, each
+adjusted in a process of its own, on one thread, by our fronts, by one dense system (``dense``, the same code with all
+cameras in one front), and by Ceres with the same priors (needs the package pyceres; robust by Cauchy's loss, with the
+noise known, which ours measures).
+
+Prints of each the cost of our objective for an observation, processor seconds and memory, both followed by their ratio
+to the first of ``--by``, and mean errors of rotations and centres. Of ours also the seconds for the uncertainties, the
+share of centres within their bounds without `track_model_error`, and the largest difference from the dense covariances.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import os
+import subprocess
+import sys
 import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from biresnerf.data.points.tracks import Tracks
-from biresnerf.data.synthetic.scene import synthetic_cameras
-from biresnerf.geometry.camera.camera import Intrinsics, project
-from biresnerf.geometry.camera.camera_models import Camera
-from biresnerf.geometry.perturb import perturb_poses
+from benchmarks.method.camera_rigs import NOISE_PX, SHAPES, Rig, rig
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_by_spread
 from biresnerf.refinement.adjustment.adjustment import adjust_poses
-from biresnerf.refinement.adjustment.evidence import Evidence, PosePrior
+from biresnerf.refinement.adjustment.cameras import Cameras
+from biresnerf.refinement.adjustment.solver import dissection
+from biresnerf.refinement.adjustment.solver.solve import Prior
+from biresnerf.refinement.adjustment.track_term import TrackTerm
+from biresnerf.refinement.finish.expected_errors import expected_errors
 from biresnerf.refinement.numbers.finish import EvidenceNumbers
 from biresnerf.studies.run_cell import peak_memory_bytes
 
-PRIOR = EvidenceNumbers().prior
-
 Array = NDArray[np.float64]
 
-POINTS, SEEN_BY, NOISE_PX, OFF = 7000, 6, 0.5, 0.002
-CAMERA = Camera("PINHOLE", 400, 400, (500.0, 500.0, 200.0, 200.0))
+ONE_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
+)
+HEAD = (
+    "| rig | cameras | by | cost | adjusted | memory | rotation, centre | uncertainty | within | off the dense |\n"
+    "|---|---|---|---|---|---|---|---|---|---|"
+)
 
 
-def observations(world_from_cam: Array, intrinsics: Intrinsics, rng: np.random.Generator) -> Tracks:
-    """Of points within the dome."""
-    points = rng.uniform(-0.8, 0.8, (POINTS, 3))
-    point = np.repeat(np.arange(POINTS), SEEN_BY)
-    image = np.concatenate([np.sort(rng.permutation(len(world_from_cam))[:SEEN_BY]) for _ in points])
-    poses = world_from_cam[image]
-    in_cam = np.einsum("mji,mj->mi", poses[:, :3, :3], points[point] - poses[:, :3, 3])
-    xy = project(intrinsics, torch.from_numpy(image), torch.from_numpy(in_cam)).numpy()
-    return Tracks(point, image, xy + rng.normal(0, NOISE_PX, xy.shape))
+def measured(shape: str, count: int, by: str, out: Path) -> dict[str, Any]:
+    """Of one adjustment, in this process; covariances go to a file."""
+    given = rig(shape, count)
+    if by == "dense":
+        dissection.ONE_FRONT = 1 << 30
+    before, began = peak_memory_bytes(), time.process_time()
+    poses = _by_ceres(given) if by == "ceres" else _by_fronts(given)
+    found = {"seconds": time.process_time() - began}
+    if by != "ceres":
+        began = time.process_time()
+        errors = expected_errors(poses, poses, given.evidence)
+        found["uncertainty"] = time.process_time() - began
+        off = camera_errors(align_by_spread(given.truth, poses).apply_to_poses(given.truth), poses)
+        found["within"] = float(
+            (off.centre <= errors.bounds_90()[1] / EvidenceNumbers().track_model_error).mean()
+        )
+        np.save(out, errors.covariance)
+    found["memory"] = peak_memory_bytes() - before
+    off = camera_errors(align_by_spread(poses, given.truth).apply_to_poses(poses), given.truth)
+    found |= {"rotation": float(off.rotation_deg.mean()), "centre": float(off.centre.mean())}
+    return found | {"cost": _cost(given, poses)}
 
 
-def row(count: int) -> str:
-    """Of so many cameras."""
-    rng = np.random.default_rng(0)
-    truth = synthetic_cameras(count, seed=1)
-    intrinsics = Intrinsics.from_cameras([CAMERA] * count)
-    evidence = Evidence(intrinsics, observations(truth, intrinsics, rng))
-    start = perturb_poses(truth, OFF, seed=1)
-    distance = float(np.linalg.norm(truth[:, :3, 3], axis=1).mean())
-    started = time.monotonic()
-    found = adjust_poses(start, evidence, PosePrior.equal(start, PRIOR, PRIOR * distance))
-    seconds = time.monotonic() - started
-    before, after = (
-        camera_errors(align_by_spread(poses, truth).apply_to_poses(poses), truth).rotation_deg.mean()
-        for poses in (start, found.world_from_cam)
+def _by_fronts(given: Rig) -> Array:
+    return adjust_poses(given.given, given.evidence, given.prior).world_from_cam
+
+
+def _by_ceres(given: Rig) -> Array:
+    from benchmarks.method.ceres_child import adjusted
+
+    return adjusted(given)
+
+
+def _cost(given: Rig, poses: Array) -> float:
+    """Of our objective with the true noise, an observation."""
+    cameras, tracks = Cameras.of(poses), given.evidence.tracks
+    assert tracks is not None
+    term = TrackTerm(tracks, given.evidence.intrinsics, cameras, NOISE_PX)
+    term.settle(cameras)
+    total = term.cost(cameras, term.unknowns) + Prior.of(given.prior).cost(cameras)
+    return total / len(tracks.point)
+
+
+def _row(shape: str, count: int, by: str, found: dict[str, Any], first: dict[str, Any], off: str) -> str:
+    ours, memory = found["seconds"], found["memory"]
+    told = ("–", "–")
+    if "within" in found:
+        told = f"{found['uncertainty']:.1f} s", f"{100 * found['within']:.0f} %"
+    return (
+        f"| {shape} | {count} | {by} | {found['cost']:.5f} | {ours:.1f} s, {ours / first['seconds']:.2f} "
+        f"| {memory / 1e6:.0f} MB, {memory / first['memory']:.2f} "
+        f"| {found['rotation']:.4f}°, {found['centre']:.5f} | {told[0]} | {told[1]} | {off} |"
     )
-    memory = peak_memory_bytes() / 1e9
-    return f"| {count} | {6 * count} | {seconds:.0f} s | {before:.3f}° | {after:.3f}° | {memory:.1f} GB |"
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("cameras", type=int, nargs="+")
-    print("| cameras | unknowns | time | error before | after | memory |\n|---|---|---|---|---|---|")
-    for count in parser.parse_args().cameras:
-        print(row(count), flush=True)
+    parser.add_argument("--shapes", nargs="+", default=list(SHAPES), choices=SHAPES)
+    parser.add_argument("--counts", nargs="+", type=int, default=[100, 300])
+    parser.add_argument("--by", nargs="+", default=["sparse", "dense"], choices=("sparse", "dense", "ceres"))
+    parser.add_argument("--child", nargs=2, help=argparse.SUPPRESS)
+    asked = parser.parse_args()
+    if asked.child:
+        _by_fronts(rig("ring", 12))  # compiles
+        found = measured(asked.shapes[0], asked.counts[0], asked.by[0], Path(asked.child[1]))
+        Path(asked.child[0]).write_text(json.dumps(found))
+        return
+    print(HEAD)
+    with TemporaryDirectory() as folder:
+        for shape, count in ((shape, count) for shape in asked.shapes for count in asked.counts):
+            all_found, covariances = {}, {}
+            for by in asked.by:
+                files = [str(Path(folder, name)) for name in (f"{by}.json", f"{by}.npy")]
+                command = [
+                    sys.executable,
+                    "-m",
+                    "benchmarks.method.many_cameras",
+                    "--shapes",
+                    shape,
+                    "--counts",
+                    str(count),
+                ]
+                subprocess.run(
+                    [*command, "--by", by, "--child", *files], check=True, env=os.environ | ONE_THREAD
+                )
+                all_found[by] = json.loads(Path(files[0]).read_text())
+                covariances[by] = np.load(files[1]) if by != "ceres" else None
+                print(
+                    _row(shape, count, by, all_found[by], all_found[asked.by[0]], _off(covariances, by)),
+                    flush=True,
+                )
+
+
+def _off(covariances: dict[str, Any], by: str) -> str:
+    """The largest difference of the sparse covariances from the dense ones, by standard deviations."""
+    if by == "ceres" or len(covariances) < 2 or covariances.get("dense") is None:
+        return "–"
+    sparse, dense = covariances["sparse"], covariances["dense"]
+    deviation = np.sqrt(np.diagonal(dense, axis1=1, axis2=2))
+    off = np.abs(sparse - dense) / (deviation[:, :, None] * deviation[:, None, :])
+    return f"{np.nanmax(off):.1e}"
 
 
 if __name__ == "__main__":

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from biresnerf.data.points.tracks import KEPT, Tracks
 
-MOST_OBSERVATIONS = 200_000  # handed on: checkpoints carry them, 16 bytes each
+# Handed on: checkpoints carry them, 16 bytes each. Of an image, where that is more.
+MOST_OBSERVATIONS, OF_IMAGE = 200_000, 200
 
 
 def write_tracks(database_path: Path, work: Path) -> Tracks | None:
@@ -32,7 +33,7 @@ def write_tracks(database_path: Path, work: Path) -> Tracks | None:
     tracks = Tracks.of_matches(np.concatenate(images), np.concatenate(xy))
     if tracks is None:
         return None
-    tracks = tracks.thinned(MOST_OBSERVATIONS, len(number))
+    tracks = tracks.thinned(max(MOST_OBSERVATIONS, OF_IMAGE * len(number)), len(number))
     arrays: dict[str, Any] = tracks.kept()
     np.savez(work / KEPT, **arrays)
     return tracks

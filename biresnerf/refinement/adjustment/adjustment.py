@@ -17,11 +17,12 @@ from biresnerf.refinement.adjustment.lens.lenses import (
     LENS,
     Lenses,
     LensEstimate,
-    posterior,
 )
 from biresnerf.refinement.adjustment.measured_terms import measured_terms
 from biresnerf.refinement.adjustment.patch_term import PatchTerm
-from biresnerf.refinement.adjustment.solver.covariance import covariance, of_each, without_lenses
+from biresnerf.refinement.adjustment.solver.blocks import Blocks
+from biresnerf.refinement.adjustment.solver.covariance import covariance
+from biresnerf.refinement.adjustment.solver.lens_deviations import posterior
 from biresnerf.refinement.adjustment.solver.solve import Prior, minimise, normal_equations
 from biresnerf.refinement.adjustment.solver.term import Term
 from biresnerf.refinement.adjustment.track_term import ROBUST_SCALE, TrackTerm
@@ -169,8 +170,8 @@ def _halves(cameras: Cameras, evidence: Evidence, prior: Prior) -> Halves:
         ends.append(end)
         inliers.append(float(term.inliers(end).mean()))
         information, _ = normal_equations(end, [term.linearise(end, 0.0)], prior)
-        among = without_lenses(information, end, prior.free[POSE * len(end) :])
-        turned = of_each(covariance(end, among, bodies=prior.bodies))[:, :3, :3]
+        free = prior.free[POSE * len(end) :]
+        turned = covariance(end, information, free, bodies=prior.bodies)[:, :3, :3]
         expected += float(np.trace(turned, axis1=1, axis2=2).mean())
     middle = ends[1].moved(ends[0].apart(ends[1]) / 2)
     apart = _rotations_deg(ends[0], ends[1])
@@ -189,10 +190,8 @@ def _rotations_deg(one: Cameras, other: Cameras) -> Array:
 def _lens_estimate(
     cameras: Cameras, terms: list[Term], lenses: Lenses, numbers: EvidenceNumbers
 ) -> LensEstimate:
-    information = np.zeros((cameras.unknowns, cameras.unknowns))
-    for term in terms:
-        information += term.linearise(cameras, 0.0).system
-    deviation = posterior(information, POSE * len(cameras), lenses)
+    information = sum((term.linearise(cameras, 0.0).system for term in terms), Blocks.nothing(cameras))
+    deviation = posterior(cameras, information, lenses)
     with np.errstate(invalid="ignore"):
         observable = lenses.free & (deviation < numbers.observable * lenses.deviation)
     return LensEstimate(cameras.lens, deviation, observable)

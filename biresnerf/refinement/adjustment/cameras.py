@@ -102,6 +102,16 @@ class Cameras:
         lenses = POSE * len(self) + LENS * self.lens_of[image][:, None] + self.kinds
         return np.concatenate([poses, lenses], axis=1)
 
+    def parts(self, image: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Each image's camera among cameras and lenses, and its lens if anything of lenses is unknown, [m, 1 or 2]."""
+        parts = [image, len(self) + self.lens_of[image]] if len(self.kinds) else [image]
+        return np.stack(parts, 1)
+
+    @property
+    def offsets(self) -> NDArray[np.int64]:
+        """Where the unknowns of `rows` are within their part [6 + kinds]."""
+        return np.concatenate([np.arange(POSE), self.kinds])
+
     def lens_rows(self, given: Array) -> Array:
         """Rows of `lens_rows` [n, 5] as the kernels take lenses like these [n, 11]."""
         rows = np.concatenate([given, np.zeros((len(given), 4)), given[:, :2]], axis=1)

@@ -16,6 +16,7 @@ from biresnerf.geometry.similarity import Similarity, align_points
 from biresnerf.judging.compare import MEASURED, compare
 from biresnerf.refinement.adjustment.cameras import POSE, Cameras
 from biresnerf.refinement.adjustment.evidence import Control, Evidence, Positions
+from biresnerf.refinement.adjustment.solver.blocks import Blocks
 from biresnerf.refinement.adjustment.solver.term import Linearised
 from biresnerf.refinement.adjustment.track_term import RAYLEIGH_MEDIAN, ROBUST_SCALE, TrackTerm
 
@@ -64,10 +65,10 @@ class PositionTerm:
     def linearise(self, cameras: Cameras, damping: float) -> Linearised:
         residual = self._residuals(cameras)
         weight = (ROBUST_SCALE**2 / (ROBUST_SCALE**2 + self.squares(cameras)) / self.noise) ** 2
-        system, right = np.zeros((cameras.unknowns,) * 2), np.zeros(cameras.unknowns)
+        own, right = np.zeros((len(weight), POSE, POSE)), np.zeros(cameras.unknowns)
+        own[:, 3:, 3:] = np.einsum("m,mka,mkb->mab", weight, self._whitened, self._whitened)
+        system = Blocks.of_cameras(cameras, self._positions.image, own)
         rows = POSE * self._positions.image[:, None] + np.arange(3, 6)
-        own = np.einsum("m,mka,mkb->mab", weight, self._whitened, self._whitened)
-        np.add.at(system, (rows[:, :, None], rows[:, None, :]), own)
         np.add.at(right, rows, np.einsum("m,mka,mk->ma", weight, self._whitened, residual))
         return Linearised(system, right, ())
 

@@ -18,6 +18,7 @@ from biresnerf.refinement.adjustment.kernels.patches import (
     patch_system,
     settle_scales,
 )
+from biresnerf.refinement.adjustment.solver.blocks import Blocks
 from biresnerf.refinement.adjustment.solver.in_parts import in_parts
 from biresnerf.refinement.adjustment.solver.term import Linearised
 from biresnerf.refinement.numbers.finish import EvidenceNumbers
@@ -61,6 +62,7 @@ class PatchTerm:
         self.frames = np.stack([photos.offsets[:-1], photos.widths, photos.heights], 1).astype(np.int64)
         self.unknowns = np.ones(len(patches))
         self._expected = numbers.pixel_noise, numbers.pixel_shift
+        self._tied: Blocks | None = None
         self._blur, self.scale = self._levels[0]
         self.blur(self._blur)
 
@@ -108,23 +110,25 @@ class PatchTerm:
         return float(count * robust.sum() / self.noise**2 + (away**2).sum())
 
     def linearise(self, cameras: Cameras, damping: float) -> Linearised:
-        size = cameras.unknowns
-        rows = cameras.rows(self.patches.host), cameras.rows(self.patches.target)
+        images = self.patches.host, self.patches.target
+        rows, parts = ([of(each) for each in images] for of in (cameras.rows, cameras.parts))
         deviation = self._numbers.scale_deviation
         fixed = *self._expected, self.scale, deviation, self.noise, damping
         of_target = np.zeros(rows[1].shape)
+        if self._tied is None:
+            together = np.insert(parts[1], self.start[:-1], parts[0], axis=0)
+            self._tied = Blocks.tied(cameras, self.start + np.arange(len(self.start)), together)
+        tied = self._tied
 
-        def linearised(part: tuple[slice, Seen]) -> tuple[Array, Array, tuple[Array, ...]]:
+        def linearised(part: tuple[slice, Seen]) -> tuple[Blocks, Array, tuple[Array, ...]]:
             taken, seen = part
-            system, right = np.zeros((size, size)), np.zeros(size)
-            back = patch_system(
-                *seen, rows[0][taken], rows[1], cameras.kinds, *fixed, system, right, of_target
-            )
-            return system, right, back
+            system, right = tied.zero, np.zeros(cameras.unknowns)
+            at = rows[0][taken], rows[1], parts[0][taken], parts[1], cameras.offsets
+            return system, right, patch_system(*seen, *at, *fixed, system.arrays, right, of_target)
 
-        parts = self._in_parts(linearised, cameras, self.unknowns)
-        back = [np.concatenate(each) for each in zip(*(part[2] for part in parts), strict=True)]
-        system, right = (np.sum([part[k] for part in parts], axis=0) for k in (0, 1))
+        found = self._in_parts(linearised, cameras, self.unknowns)
+        back = [np.concatenate(each) for each in zip(*(one[2] for one in found), strict=True)]
+        system, right = sum((one[0] for one in found), tied), np.sum([one[1] for one in found], axis=0)
         return Linearised(system, right, (*back, of_target, *rows))
 
     def stepped(self, linearised: Linearised, motion: Array) -> Array:

@@ -18,6 +18,7 @@ from biresnerf.refinement.adjustment.kernels.tracks import (
     track_system,
 )
 from biresnerf.refinement.adjustment.lens.fisheyes import with_corrections
+from biresnerf.refinement.adjustment.solver.blocks import Blocks
 from biresnerf.refinement.adjustment.solver.in_parts import in_parts
 from biresnerf.refinement.adjustment.solver.term import Linearised
 from biresnerf.refinement.adjustment.tangent_views import TangentViews
@@ -58,6 +59,7 @@ class TrackTerm:
         self.noise_px = 1.0 if noise_px is None else noise_px
         self._intrinsics = intrinsics
         self._views: tuple[Cameras, TangentViews] | None = None
+        self._tied: Blocks | None = None
         now = with_corrections(intrinsics, cameras.lens_of, cameras.lens)
         rays = directions_in_cam(now, torch.from_numpy(self.image), torch.from_numpy(self.xy)).numpy()
         flat = ~intrinsics.fisheye.numpy()[self.image]
@@ -132,20 +134,21 @@ class TrackTerm:
         return float(track_cost(*seen, self.known, self.place, self.noise_px, ROBUST_SCALE))
 
     def linearise(self, cameras: Cameras, damping: float) -> Linearised:
-        size, rows = cameras.unknowns, cameras.rows(self.image)
+        rows, parts = cameras.rows(self.image), cameras.parts(self.image)
         mixed, fixed = np.zeros((*rows.shape, 3)), (self.noise_px, ROBUST_SCALE, damping)
+        if self._tied is None:
+            self._tied = Blocks.tied(cameras, self.start, parts)
+        tied = self._tied
 
-        def linearised(points: slice) -> tuple[Array, Array, tuple[Array, Array]]:
-            system, right = np.zeros((size, size)), np.zeros(size)
+        def linearised(points: slice) -> tuple[Blocks, Array, tuple[Array, Array]]:
+            system, right = tied.zero, np.zeros(cameras.unknowns)
             seen = (*self._seen(cameras, self.unknowns, points), self.known[points], self.place[points])
-            back = track_system(*seen, rows, cameras.kinds, *fixed, system, right, mixed)
-            return system, right, back
+            at = rows, parts, cameras.offsets
+            return system, right, track_system(*seen, *at, *fixed, system.arrays, right, mixed)
 
-        parts = in_parts(linearised, len(self.unknowns))
-        inverses, gradients = (
-            np.concatenate(each) for each in zip(*(part[2] for part in parts), strict=True)
-        )
-        system, right = (np.sum([part[k] for part in parts], axis=0) for k in (0, 1))
+        found = in_parts(linearised, len(self.unknowns))
+        inverses, gradients = (np.concatenate(each) for each in zip(*(one[2] for one in found), strict=True))
+        system, right = sum((one[0] for one in found), tied), np.sum([one[1] for one in found], axis=0)
         return Linearised(system, right, (inverses, gradients, mixed, rows))
 
     def stepped(self, linearised: Linearised, motion: Array) -> Array:

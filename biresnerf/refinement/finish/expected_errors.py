@@ -14,12 +14,9 @@ from biresnerf.refinement.adjustment.adjustment import patch_term, track_term
 from biresnerf.refinement.adjustment.cameras import Cameras
 from biresnerf.refinement.adjustment.evidence import Evidence
 from biresnerf.refinement.adjustment.measured_terms import measured_terms
-from biresnerf.refinement.adjustment.solver.covariance import (
-    covariance,
-    largest_group,
-    of_each,
-    without_lenses,
-)
+from biresnerf.refinement.adjustment.solver.blocks import Blocks
+from biresnerf.refinement.adjustment.solver.covariance import covariance
+from biresnerf.refinement.adjustment.solver.elimination import largest_group
 from biresnerf.refinement.adjustment.solver.solve import ROUNDS, SETTLED
 
 NORMAL_90 = 1.2816  # of a normal deviate: one in ten is above it
@@ -98,31 +95,31 @@ def expected_errors(
     cameras, lenses, numbers = Cameras.of(preferred, evidence.lenses), evidence.lenses, evidence.numbers
     n = len(cameras)
     by_tracks, by_patches = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
-    information = np.zeros((cameras.unknowns, cameras.unknowns))
+    information = Blocks.nothing(cameras)
     tracks, patches = track_term(cameras, evidence, None), patch_term(cameras, evidence, patch_noise)
     if tracks is not None:
         for _ in range(ROUNDS):
             if tracks.measure(cameras) < SETTLED:
                 break
         by_tracks[tracks.image] = True
-        information += tracks.linearise(cameras, 0.0).system / numbers.track_model_error**2
+        information += tracks.linearise(cameras, 0.0).system * numbers.track_model_error**-2
     if patches is not None:
         patches.settle(cameras)
         by_patches[patches.patches.target] = by_patches[patches.patches.host] = True
-        information += patches.linearise(cameras, 0.0).system / numbers.patch_model_error**2
-    for term in measured_terms(evidence, cameras).values() if information.any() else ():
+        information += patches.linearise(cameras, 0.0).system * numbers.patch_model_error**-2
+    for term in measured_terms(evidence, cameras).values() if information.values.any() else ():
         term.measure(cameras)
         information += term.linearise(cameras, 0.0).system
     # Photos of another scene match each other, but say nothing of where the others stand.
-    together = largest_group(information, n)
+    together, free = largest_group(information), None
     if lenses is not None:
-        before = np.where(lenses.free, 1 / np.where(lenses.free, lenses.deviation, 1.0) ** 2, 0.0).reshape(-1)
-        information[6 * n :, 6 * n :] += np.diag(before)
-        information = without_lenses(information, cameras, lenses.free.reshape(-1))
-    found = of_each(covariance(cameras, information, (by_tracks | by_patches) & together, bodies))
+        free = lenses.free.reshape(-1)
+        before = np.where(free, 1 / np.where(lenses.free, lenses.deviation, 1.0).reshape(-1) ** 2, 0.0)
+        information = information.with_diagonal(np.concatenate([np.zeros(6 * n), before]))
+    found = covariance(cameras, information, free, (by_tracks | by_patches) & together, bodies)
     known = together & (_rotation(found) < numbers.most_rotation)
     if not known.all():  # what is not known must not turn the others' frame
-        found = of_each(covariance(cameras, information, known, bodies))
+        found = covariance(cameras, information, free, known, bodies)
     away = np.full((n, 6), np.nan)
     if known.any():
         frame = bodies and bodies.input_from_optimised(preferred, world_from_cam)

@@ -90,8 +90,9 @@ def without_patches(
     if tracks is not None:
         tracks = straight_tracks(tracks, intrinsics, ideal)
         fitted, judging = tracks.split()
-        tracks = tracks.thinned(numbers.most_in_the_end, len(dataset))
-        fitted = fitted and fitted.thinned(numbers.most_observations, len(dataset))
+        candidates, end = (of_camera * len(dataset) for of_camera in numbers.of_camera)
+        tracks = tracks.thinned(max(numbers.most_in_the_end, end), len(dataset))
+        fitted = fitted and fitted.thinned(max(numbers.most_observations, candidates), len(dataset))
     measured = measured_evidence(dataset, joint.unit_from_cam, placed, numbers)
     return SplitEvidence(
         replace(measured, tracks=fitted, lenses=before if before.free.any() else None),

@@ -13,9 +13,10 @@ from biresnerf.arrays import Array
 from biresnerf.geometry.camera.camera_models import REFINED_PARAMETERS, Camera
 from biresnerf.judging.compare import FREER_LENS, is_better
 from biresnerf.refinement.adjustment.adjustment import Adjustment, adjust_poses, track_term
-from biresnerf.refinement.adjustment.cameras import POSE, Cameras
+from biresnerf.refinement.adjustment.cameras import Cameras
 from biresnerf.refinement.adjustment.evidence import Evidence, PosePrior
-from biresnerf.refinement.adjustment.lens.lenses import FOCAL, K1, KINDS, LENS, Lenses, posterior
+from biresnerf.refinement.adjustment.lens.lenses import FOCAL, K1, KINDS, LENS, Lenses
+from biresnerf.refinement.adjustment.solver.lens_deviations import posterior
 from biresnerf.refinement.adjustment.solver.solve import Prior, newton_step
 from biresnerf.refinement.adjustment.track_term import ROBUST_SCALE
 
@@ -86,7 +87,7 @@ def _told(best: Adjustment, fitted: Evidence, prior: PosePrior, kept: Lenses) ->
     if step is None:
         return np.zeros(len(lenses.free), np.bool_)
     moved = np.abs(cameras.split(step)[1])
-    deviation = posterior(linear.system, POSE * len(cameras), lenses)
+    deviation = posterior(cameras, linear.system, lenses)
     with np.errstate(invalid="ignore"):
         known = lenses.free & ~kept.free & (deviation < fitted.numbers.observable * lenses.deviation)
         return np.asarray((known & (moved > fitted.numbers.track_model_error * deviation)).any(1))

@@ -12,7 +12,7 @@ from biresnerf.geometry.similarity import Similarity, align_robust
 from biresnerf.refinement.adjustment.adjustment import adjust_poses
 from biresnerf.refinement.adjustment.cameras import Cameras
 from biresnerf.refinement.adjustment.evidence import Evidence, PosePrior
-from biresnerf.refinement.adjustment.solver.body_motions import body_columns, rigid_motion
+from biresnerf.refinement.adjustment.solver.body_motions import BodyMoves, rigid_motion
 from biresnerf.refinement.finish.expected_errors import expected_errors
 from biresnerf.refinement.numbers.finish import EvidenceNumbers
 from tests.refinement.adjustment.rig import disturbed, observed, pinholes, ring
@@ -79,16 +79,13 @@ def test_a_camera_that_is_known_exactly_fixes_its_body(rng):
 
 def test_the_columns_of_bodies_are_the_derivative_of_their_rigid_motion(rng):
     cameras = Cameras.of(ring(CAMERAS, rng))
-    columns = body_columns(cameras, FIXED_PAIRS)
-    assert columns.shape == (6 * CAMERAS, 6 * 4)
-    step = 1e-6 * rng.normal(size=columns.shape[1])
-    to_first_order = (columns @ step).reshape(CAMERAS, 6)
+    moves = BodyMoves.among(cameras, FIXED_PAIRS)
+    assert moves.bodies == 4
+    to_first_order = moves.of_cameras(1e-6 * rng.normal(size=(4, 6)))
     exact = rigid_motion(cameras, FIXED_PAIRS, to_first_order)
     np.testing.assert_allclose(to_first_order, exact, atol=1e-10)
-    moved = cameras.moved(1e5 * (columns @ step))
-    rigid = cameras.moved(
-        rigid_motion(cameras, FIXED_PAIRS, 1e5 * (columns @ step).reshape(CAMERAS, 6)).reshape(-1)
-    )
+    moved = cameras.moved(1e5 * to_first_order.reshape(-1))
+    rigid = cameras.moved(rigid_motion(cameras, FIXED_PAIRS, 1e5 * to_first_order).reshape(-1))
     lengths = [
         np.linalg.norm(each.centre[::2] - each.centre[1::2], axis=1) for each in (cameras, rigid, moved)
     ]

@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from biresnerf.field.numba_kernels import njit
+from biresnerf.refinement.adjustment.kernels.blocks import add_block
 from biresnerf.refinement.adjustment.kernels.compiled import KERNEL
 from biresnerf.refinement.adjustment.kernels.lens import bent, bent_slopes, by_unknown
 from biresnerf.refinement.adjustment.kernels.photo_samples import sample
@@ -196,21 +197,21 @@ def settle_scales(
 
 @njit(**KERNEL)
 def patch_system(
-    rotation, centre, lens, photos, values, host, rays, rho, start, target, s, host_rows, target_rows, kinds, floor,
-    slope, scale, deviation, noise, damping, system, right, of_target,
+    rotation, centre, lens, photos, values, host, rays, rho, start, target, s, host_rows, target_rows, host_parts,
+    target_parts, offsets, floor, slope, scale, deviation, noise, damping, system, right, of_target,
 ):  # fmt: skip
-    """Add the normal equations without the scales to system [u, u] and right [u], which is half the gradient.
+    """Add the normal equations without the scales to the system, as `add_block`, and right [u], half the gradient.
 
     Args:
         host_rows, target_rows: [patches, w], [m, w], where the w = 6 + k unknowns of each one's camera, and those of
             its lens, are among all u.
-        kinds: [k], which of a lens's parameters these are.
+        host_parts, target_parts, offsets: where these are among the system's blocks, see `Cameras`.
 
     Returns of each patch the inverse of its own entry and its gradient, and the mixed row of its host. Fills that of
     each target [m, w].
     """
     patches, pixels, channels = len(host), values.shape[1], values.shape[2]
-    width = host_rows.shape[1]
+    width, kinds = host_rows.shape[1], offsets[6:]
     last = 2 * width
     work, r, jac = (
         work_space(channels),
@@ -219,7 +220,7 @@ def patch_system(
     )
     inverses, gradients, of_host = np.zeros(patches), np.zeros(patches), np.zeros((patches, width))
     block, force = np.empty((last + 1, last + 1)), np.empty(last + 1)
-    s2 = scale * scale
+    outer, s2 = np.empty((width, width)), scale * scale
     for i in range(patches):
         own = 1.0 / (deviation * deviation)
         gradients[i] = (s[i] - 1) * own
@@ -239,17 +240,25 @@ def patch_system(
                 right[j[a]] += force[width + a]
                 of_host[i, a] += block[a, last]
                 of_target[e, a] = block[width + a, last]
-                for b in range(width):
-                    system[h[a], h[b]] += block[a, b]
-                    system[j[a], j[b]] += block[width + a, width + b]
-                    system[h[a], j[b]] += block[a, width + b]
-                    system[j[a], h[b]] += block[width + a, b]
+            one, two = host_parts[i], target_parts[e]
+            add_block(system, one, one, offsets, block[:width, :width])
+            add_block(system, two, two, offsets, block[width:last, width:last])
+            add_block(system, one, two, offsets, block[:width, width:last])
+            add_block(system, two, one, offsets, block[width:last, :width])
             own += block[last, last]
             gradients[i] += force[last]
         inverses[i] = 1.0 / (own * (1 + damping))
-        _eliminate(
-            h, of_host[i], gradients[i], inverses[i], start[i], start[i + 1], target_rows, of_target, system, right
-        )  # fmt: skip
+        first, end = start[i], start[i + 1]
+        for e in range(first - 1, end):
+            left, one = (of_host[i], host_parts[i]) if e < first else (of_target[e], target_parts[e])
+            for a in range(width):
+                right[h[a] if e < first else target_rows[e, a]] -= inverses[i] * left[a] * gradients[i]
+            for g in range(first - 1, end):
+                across, two = (of_host[i], host_parts[i]) if g < first else (of_target[g], target_parts[g])
+                for a in range(width):
+                    for b in range(width):
+                        outer[a, b] = -inverses[i] * left[a] * across[b]
+                add_block(system, one, two, offsets, outer)
     return inverses, gradients, of_host
 
 
@@ -269,20 +278,3 @@ def weighted_squares(jac, r, w, block, force):
     for a in range(size):
         for b in range(a):
             block[a, b] = block[b, a]
-
-
-@njit(inline="always", **KERNEL)
-def _eliminate(host_rows, of_host, gradient, inverse, first, last, target_rows, of_target, system, right):
-    """Take one patch's scale out of the equations of cameras and lenses."""
-    width = len(of_host)
-    for e in range(first - 1, last):
-        for a in range(width):
-            x = inverse * (of_host[a] if e < first else of_target[e, a])
-            if x == 0:
-                continue
-            one = host_rows[a] if e < first else target_rows[e, a]
-            right[one] -= x * gradient
-            for g in range(first - 1, last):
-                for b in range(width):
-                    other = host_rows[b] if g < first else target_rows[g, b]
-                    system[one, other] -= x * (of_host[b] if g < first else of_target[g, b])

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from biresnerf.field.numba_kernels import njit
+from biresnerf.refinement.adjustment.kernels.blocks import add_block
 from biresnerf.refinement.adjustment.kernels.compiled import KERNEL, LEAST_DETERMINANT
 from biresnerf.refinement.adjustment.kernels.lens import bent, bent_slopes, by_unknown
 
@@ -163,13 +164,15 @@ def track_cost(rotation, centre, lens, xyz, start, image, xy, known, place, sigm
 
 
 @njit(**KERNEL)
-def eliminate_point(rows, first, last, blocks, forces, mixed, inverse, gradient, system, right):
+def eliminate_point(
+    rows, parts, offsets, first, last, blocks, forces, mixed, inverse, gradient, system, right
+):
     """Add a point's observations, from first to last, to the normal equations of cameras and lenses alone.
 
     `blocks` and `forces` are the cameras' own, counted from the first; `inverse` and `gradient` the point's.
     """
     width = rows.shape[1]
-    through = np.empty((width, 3))
+    through, block = np.empty((width, 3)), np.empty((width, width))
     for e in range(first, last):
         for a in range(width):
             for b in range(3):
@@ -181,35 +184,36 @@ def eliminate_point(rows, first, last, blocks, forces, mixed, inverse, gradient,
             right[row] += forces[e - first, a]
             for b in range(3):
                 right[row] -= through[a, b] * gradient[b]
-            for b in range(width):
-                system[row, rows[e, b]] += blocks[e - first, a, b]
+        add_block(system, parts[e], parts[e], offsets, blocks[e - first])
         for g in range(first, last):
+            if parts.shape[1] == 1 and parts[e, 0] > parts[g, 0]:
+                continue
             for a in range(width):
-                row = rows[e, a]
                 for b in range(width):
-                    system[row, rows[g, b]] -= (
+                    block[a, b] = -(
                         through[a, 0] * mixed[g, b, 0]
                         + through[a, 1] * mixed[g, b, 1]
                         + through[a, 2] * mixed[g, b, 2]
                     )
+            add_block(system, parts[e], parts[g], offsets, block)
 
 
 @njit(**KERNEL)
 def track_system(
-    rotation, centre, lens, xyz, start, image, xy, known, place, rows, kinds, sigma, scale, damping, system, right,
-    mixed,
+    rotation, centre, lens, xyz, start, image, xy, known, place, rows, parts, offsets, sigma, scale, damping, system,
+    right, mixed,
 ):  # fmt: skip
-    """Add the normal equations without the points to system [u, u] and right [u], which is half the gradient.
+    """Add the normal equations without the points to the system, as `add_block`, and right [u], half the gradient.
 
     Args:
         rows: [m, 6 + k], where the unknowns of each observation's camera, and those of its lens, are among all u.
-        kinds: [k], which of a lens's parameters these are.
+        parts, offsets: [m, 1 or 2] and [6 + k], where these are among the system's blocks, see `Cameras`.
         mixed: zero; gets the mixed block [m, 6 + k, 3] of each observation of these points.
 
     Returns for each point the inverse of its own block and its gradient.
     A point that its observations do not fix in this precision has a zero inverse, and no say.
     """
-    points, width = len(xyz), rows.shape[1]
+    points, width, kinds = len(xyz), rows.shape[1], offsets[6:]
     inverses, gradients = np.zeros((points, 3, 3)), np.zeros((points, 3))
     own, jac, camera = np.empty((3, 3)), np.empty((2, 3)), np.empty((2, width))
     r, v, q = np.empty(2), np.empty(3), np.empty(3)
@@ -256,6 +260,6 @@ def track_system(
             gradients[i] = 0
             continue
         eliminate_point(
-            rows, first, start[i + 1], blocks, forces, mixed, inverses[i], gradients[i], system, right
-        )
+            rows, parts, offsets, first, start[i + 1], blocks, forces, mixed, inverses[i], gradients[i], system, right
+        )  # fmt: skip
     return inverses, gradients

@@ -21,8 +21,6 @@ FOCAL, K1, K2, CENTRE, TANGENTIAL, ASPECT = 0, 1, 2, slice(3, 5), slice(5, 7), 7
 DISTORTION = [1, 2, 5, 6]  # k1, k2, p1, p2
 # In the order in which they are given up where the evidence does not tell of them, the last first, and freed.
 KINDS = ((0,), (3, 4), (1,), (2,), (5, 6), (7,))
-RANK = 1e-13  # of the largest eigenvalue: what is smaller is rounding, or one of the motions of the whole rig
-ROUNDING = 1e-12  # of a lens's own information: what poses leave of it, if that is not more, is rounding
 NEWTON = 8
 FURTHEST = 2.0  # times the slope itself that Newton's method may go
 LEAST_AREA = 0.1  # that it takes a lens to shrink things to
@@ -69,40 +67,6 @@ class LensEstimate:
     correction: Array
     deviation: Array
     observable: NDArray[np.bool_]
-
-
-def posterior(information: Array, poses: int, lenses: Lenses) -> Array:
-    """Standard deviations [g, 8] of lenses, with poses unknown but for the evidence; NaN of those held.
-
-    The prior of the poses has no part in it: if they err alike, it would pass for knowledge of the lens.
-
-    Args:
-        information: [u, u], of the evidence alone.
-        poses: how many of the u unknowns come first and are those of poses.
-    """
-    free = lenses.free.reshape(-1)
-    among = information[:poses, :poses]
-    mixed, own = information[:poses, poses:][:, free], information[poses:, poses:][np.ix_(free, free)]
-    size = np.sqrt(np.maximum(np.diagonal(among), 1e-300))
-    values, vectors = np.linalg.eigh(among / size[:, None] / size[None, :])
-    known = values > RANK * values.max(initial=1e-300)
-    seen = (vectors[:, known].T @ (mixed / size[:, None])) / np.sqrt(values[known])[:, None]
-    before = np.diag(1 / lenses.deviation.reshape(-1)[free] ** 2)
-    deviation = np.full(len(free), np.nan)
-    deviation[free] = _deviations(own, seen.T @ seen, before)
-    return deviation.reshape(-1, LENS)
-
-
-def _deviations(own: Array, shared: Array, before: Array) -> Array:
-    """Of the information `own` less `shared`, and of what was known before; what rounding has left of it is nothing."""
-    size = np.sqrt(np.maximum(np.diagonal(own) + np.diagonal(before), 1e-300))
-    values, vectors = np.linalg.eigh((own - shared) / size[:, None] / size[None, :])
-    evidence = (vectors * np.where(values > ROUNDING, values, 0)) @ vectors.T
-    total = evidence + before / size[:, None] / size[None, :]
-    values, vectors = np.linalg.eigh(total)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        shares = np.where(vectors == 0, 0.0, vectors**2 / np.maximum(values, 0))
-        return np.asarray(np.sqrt(shares.sum(1)) / size)
 
 
 def slopes_seen(lens: Array, shown: Array) -> Array:

@@ -8,7 +8,10 @@ from numpy.typing import NDArray
 from biresnerf.arrays import Array
 from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.refinement.adjustment.cameras import POSE, Cameras
-from biresnerf.refinement.adjustment.solver.body_motions import allowed_motions, body_columns
+from biresnerf.refinement.adjustment.lens.lenses import LENS
+from biresnerf.refinement.adjustment.solver.blocks import Blocks
+from biresnerf.refinement.adjustment.solver.body_motions import BodyMoves
+from biresnerf.refinement.adjustment.solver.elimination import inverse_blocks
 
 # What is known of any camera beside the evidence: a standard deviation of one radian and one spread of the rig. It
 # keeps the system regular, and is far beyond what linear errors can mean.
@@ -19,84 +22,60 @@ ROTATIONS_WEIGHT = 1e-3
 
 def covariance(
     cameras: Cameras,
-    information: Array,
+    information: Blocks,
+    lenses: NDArray[np.bool_] | None = None,
     aligned: NDArray[np.bool_] | None = None,
     bodies: RigidBodies | None = None,
 ) -> Array:
-    """Covariance [6n, 6n] of the cameras' rotation vectors (rad) and positions, along the world's axes.
+    """Covariances [n, 6, 6] of the cameras' rotation vectors (rad) and positions, along the world's axes.
 
     Turning, moving and scaling the whole rig changes no evidence. Errors are measured after the similarity that aligns
-    the centres best, and so is the covariance: with H the centres' common motions, it is the upper left block of the
+    the centres best, and so is the covariance: with H the centres' common motions, it is of the upper left block of the
     inverse of [[N, H], [H^T, 0]] (Triggs et al. 2000, section 9.3: inner constraints).
 
     Args:
-        information: N [6n, 6n], the cameras' normal equations without damping.
+        information: N, the normal equations of cameras and lenses without damping.
+        lenses: which of the 8g unknowns of lenses may move; none where None.
         aligned: the cameras [n] whose centres count in the alignment; all where None.
         bodies: cameras that are fixed or move as one. The alignment is by what they leave of turning, moving and
             scaling: nothing where two cameras are fixed, no scale where a body has several centres.
     """
     spread = float(np.sqrt(((cameras.centre - cameras.centre.mean(0)) ** 2).sum(1).mean())) or 1.0
     # Positions count in spreads of the rig.
-    unit = np.tile(np.r_[np.ones(3), np.full(3, spread)], len(cameras))
-    scaled = information * unit[:, None] * unit[None, :]
+    unit = np.r_[np.ones(3), np.full(3, spread)]
+    none = np.ones(LENS * information.lenses)
+    scaled = information.scaled(np.concatenate([np.tile(unit, len(cameras)), none]))
     counted = np.ones(len(cameras), np.bool_) if aligned is None else aligned
     in_spreads = Cameras(cameras.rotation, cameras.centre / spread)
-    common = _common_motions(in_spreads, counted)
+    common = common_motions(in_spreads, counted)
+    free = (none == 0 if lenses is None else lenses) & (scaled.diagonal[POSE * len(cameras) :] > 0)
     if bodies is None or not bodies.tied:
-        found = _inverse(scaled, _seen_aligning(common, counted))
+        found = _inverses(scaled, seen_aligning(common, counted), free)
     else:
-        moves = body_columns(in_spreads, bodies)
-        seen = _seen_aligning(common @ allowed_motions(moves, common), counted)
-        found = moves @ _inverse(moves.T @ scaled @ moves, moves.T @ seen) @ moves.T
-    return np.asarray((found + found.T) / 2 * unit[:, None] * unit[None, :])
+        moves = BodyMoves.among(in_spreads, bodies)
+        seen = seen_aligning(common @ moves.allowed(common), counted)
+        held = moves.of_bodies(seen.reshape(len(cameras), POSE, -1)).reshape(POSE * moves.bodies, -1)
+        of_body = _inverses(moves.reduced(scaled), held, free)
+        found = np.zeros((len(cameras), POSE, POSE))
+        moving = moves.of >= 0
+        own = moves.columns[moving]
+        found[moving] = own @ of_body[moves.of[moving]] @ own.transpose(0, 2, 1)
+    return np.asarray((found + found.transpose(0, 2, 1)) / 2 * unit[:, None] * unit[None, :])
 
 
-def _inverse(information: Array, common: Array) -> Array:
-    """Of [k, k], where errors have no part along common motions [k, m]."""
-    size = len(information)
-    known = information + np.eye(size) / NOTHING_KNOWN**2
-    held = common * float(np.diagonal(known).mean())  # as large as the rest: only their directions count
-    bordered = np.block([[known, held], [held.T, np.zeros((held.shape[1],) * 2)]])
-    return np.asarray(np.linalg.inv(bordered)[:size, :size])
+def _inverses(information: Blocks, common: Array, lenses: NDArray[np.bool_]) -> Array:
+    """Of each camera [n, 6, 6], where errors have no part along common motions [6n, m]; NaN where there are none."""
+    poses, none = POSE * information.cameras, np.zeros(len(lenses))
+    known = information.with_diagonal(np.concatenate([np.full(poses, 1 / NOTHING_KNOWN**2), none]))
+    held = common * float(known.diagonal[:poses].mean())  # as large as the rest: only their directions count
+    border = np.concatenate([held, np.zeros((len(lenses), held.shape[1]))])
+    found = inverse_blocks(known, np.concatenate([np.ones(poses, np.bool_), lenses]), border)
+    if found is None:
+        return np.full((information.cameras, POSE, POSE), np.nan)
+    return found[: information.cameras, :POSE, :POSE]
 
 
-def without_lenses(information: Array, cameras: Cameras, free: NDArray[np.bool_]) -> Array:
-    """The information [6n, 6n] of the poses, whatever the lenses are.
-
-    Args:
-        information: [6n + 8g, 6n + 8g], of poses and lenses, with what is known of lenses before.
-        free: which of the 8g unknowns of lenses may move.
-    """
-    poses = POSE * len(cameras)
-    moving = poses + np.flatnonzero(free)
-    mixed, own = information[:poses, moving], information[np.ix_(moving, moving)]
-    return np.asarray(information[:poses, :poses] - mixed @ np.linalg.pinv(own, hermitian=True) @ mixed.T)
-
-
-def of_each(whole: Array) -> Array:
-    """Each camera's own block [n, 6, 6] of a covariance [6n, 6n]."""
-    n = len(whole) // 6
-    return np.stack([whole[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(n)])
-
-
-def largest_group(information: Array, count: int) -> NDArray[np.bool_]:
-    """Which cameras [n] evidence ties together, directly or through others; of several groups the largest.
-
-    Args:
-        information: [6n or more, 6n or more], with the cameras first.
-        count: n.
-    """
-    own = information[: POSE * count, : POSE * count].reshape(count, POSE, count, POSE)
-    tied = (own != 0).any(axis=(1, 3)) | np.eye(count, dtype=np.bool_)
-    group = np.arange(count)
-    while True:
-        joined = np.where(tied, group, count).min(1)
-        if (joined == group).all():
-            return np.asarray(group == np.bincount(group).argmax())
-        group = joined
-
-
-def _common_motions(cameras: Cameras, counted: NDArray[np.bool_]) -> Array:
+def common_motions(cameras: Cameras, counted: NDArray[np.bool_]) -> Array:
     """What turns, moves and scales all cameras [6n, 7], about the middle of some."""
     n = len(cameras)
     away = cameras.centre - (cameras.centre[counted].mean(0) if counted.any() else 0.0)
@@ -110,7 +89,7 @@ def _common_motions(cameras: Cameras, counted: NDArray[np.bool_]) -> Array:
     return motions.reshape(6 * n, 7)
 
 
-def _seen_aligning(motions: Array, counted: NDArray[np.bool_]) -> Array:
+def seen_aligning(motions: Array, counted: NDArray[np.bool_]) -> Array:
     """Orthonormal basis [6n, m or fewer] of common motions [6n, m] as an alignment of some cameras weighs them."""
     weight = counted[:, None] * np.r_[np.full(3, ROTATIONS_WEIGHT), np.ones(3)]
     basis, sizes, _ = np.linalg.svd(motions * weight.reshape(-1, 1), full_matrices=False)

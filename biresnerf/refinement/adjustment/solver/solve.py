@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from biresnerf.arrays import Array
@@ -14,7 +13,9 @@ from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.refinement.adjustment.cameras import POSE, Cameras
 from biresnerf.refinement.adjustment.evidence import PosePrior
 from biresnerf.refinement.adjustment.lens.lenses import Lenses
-from biresnerf.refinement.adjustment.solver.body_motions import body_columns, rigid_motion
+from biresnerf.refinement.adjustment.solver.blocks import Blocks
+from biresnerf.refinement.adjustment.solver.body_motions import BodyMoves, rigid_motion
+from biresnerf.refinement.adjustment.solver.elimination import solution
 from biresnerf.refinement.adjustment.solver.term import Linearised, Term
 
 ROUNDS = 8  # of measuring the noise; it falls with the residuals, and with it what counts as wrong
@@ -58,18 +59,14 @@ class Prior:
         """Half the gradient [u], to first order in the rotations' distance."""
         return np.asarray(self.weight * cameras.apart(self.mean))
 
-    def directions(self, cameras: Cameras) -> Array | None:
-        """Increments [u, k] of cameras and lenses that k free numbers make; None where each is free for itself."""
+    def moves(self, cameras: Cameras) -> BodyMoves | None:
+        """How cameras follow bodies; None where each is free for itself."""
         if self.bodies is None or not self.bodies.shared:
             return None
-        columns, (_, lenses) = body_columns(cameras, self.bodies), np.split(self.free, [POSE * len(cameras)])
-        found = np.zeros((len(self.free), columns.shape[1] + int(lenses.sum())))
-        found[: len(columns), : columns.shape[1]] = columns
-        found[len(columns) + np.flatnonzero(lenses), columns.shape[1] + np.arange(lenses.sum())] = 1.0
-        return found
+        return BodyMoves.among(cameras, self.bodies)
 
     def rigid(self, cameras: Cameras, motion: Array) -> Array:
-        """An increment [u] along `directions`, with bodies rigid to more than first order."""
+        """An increment [u] along `moves`, with bodies rigid to more than first order."""
         if self.bodies is None or not self.bodies.shared:
             return motion
         poses, lenses = cameras.split(motion)
@@ -131,26 +128,28 @@ def newton_step(
 ) -> Array | None:
     """The increment [u] of cameras and lenses to the least linearised cost, damped; None where nothing is known."""
     system, right = normal_equations(cameras, linear, prior)
-    directions = prior.directions(cameras)
-    if directions is None:
+    moves = prior.moves(cameras)
+    if moves is None:
         return _damped(system, right, prior.free, damping)
-    along = _damped(directions.T @ system @ directions, directions.T @ right, None, damping)
-    return None if along is None else prior.rigid(cameras, directions @ along)
+    system, (poses, lenses) = moves.reduced(system), cameras.split(right)
+    right = np.concatenate([moves.of_bodies(poses).reshape(-1), lenses.reshape(-1)])
+    free = np.concatenate([np.ones(POSE * moves.bodies, np.bool_), prior.free[POSE * len(cameras) :]])
+    along = _damped(system, right, free, damping)
+    if along is None:
+        return None
+    bodies, lens_steps = np.split(along, [POSE * moves.bodies])
+    motion = moves.of_cameras(bodies.reshape(-1, POSE))
+    return prior.rigid(cameras, np.concatenate([motion.reshape(-1), lens_steps]))
 
 
-def _damped(system: Array, right: Array, free: NDArray[np.bool_] | None, damping: float) -> Array | None:
+def _damped(system: Blocks, right: Array, free: NDArray[np.bool_], damping: float) -> Array | None:
     """The damped step of the unknowns that are free and that anything is known of; None where there is none."""
-    free = (np.diagonal(system) > 0) & (True if free is None else free)
+    diagonal = system.diagonal
+    free = (diagonal > 0) & free
     if not free.any():
         return None
-    part = torch.from_numpy(system if free.all() else system[np.ix_(free, free)]).clone()
-    part.diagonal().mul_(1 + damping)
-    factor, failed = torch.linalg.cholesky_ex(part)
-    if failed:  # not positive definite: damped more, it will be
-        return None
-    step = np.zeros(len(right))
-    step[free] = -torch.cholesky_solve(torch.from_numpy(right[free])[:, None], factor)[:, 0].numpy()
-    return step if np.isfinite(step).all() else None
+    # What is not positive definite will be, damped more.
+    return solution(system.with_diagonal(damping * diagonal), -right, free)
 
 
 def total_cost(cameras: Cameras, terms: Sequence[Term], prior: Prior) -> float:
@@ -158,9 +157,9 @@ def total_cost(cameras: Cameras, terms: Sequence[Term], prior: Prior) -> float:
     return prior.cost(cameras) + sum(term.cost(cameras, term.unknowns) for term in terms)
 
 
-def normal_equations(cameras: Cameras, linear: Sequence[Linearised], prior: Prior) -> tuple[Array, Array]:
-    """Of cameras and lenses alone: matrix [u, u] and half the gradient [u]."""
-    system, right = np.diag(prior.weight), prior.right(cameras)
-    for at in linear:
+def normal_equations(cameras: Cameras, linear: Sequence[Linearised], prior: Prior) -> tuple[Blocks, Array]:
+    """Of cameras and lenses alone: the matrix and half the gradient [u]."""
+    system, right = linear[0].system, prior.right(cameras) + linear[0].right
+    for at in linear[1:]:
         system, right = system + at.system, right + at.right
-    return system, right
+    return system.with_diagonal(prior.weight), right

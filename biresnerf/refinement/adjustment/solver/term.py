@@ -7,6 +7,7 @@ from typing import Any, Protocol
 
 from biresnerf.arrays import Array
 from biresnerf.refinement.adjustment.cameras import Cameras
+from biresnerf.refinement.adjustment.solver.blocks import Blocks
 
 
 @dataclass(frozen=True, eq=False)
@@ -14,12 +15,12 @@ class Linearised:
     """A robust cost near some cameras, without the unknowns that the term keeps to itself.
 
     Attributes:
-        system: added to the normal equations [u, u] of cameras and lenses: J^T W J.
+        system: added to the normal equations of cameras and lenses: J^T W J.
         right: half the gradient [u]: J^T W r.
         back: what the term needs to move its own unknowns along.
     """
 
-    system: Array
+    system: Blocks
     right: Array
     back: tuple[Any, ...]
 

@@ -1,0 +1,186 @@
+"""Cameras that see what is near them: systems eliminated front by front are those of one dense matrix."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.method.camera_rigs import rig
+from biresnerf.geometry.rigid_bodies import RigidBodies
+from biresnerf.refinement.adjustment.adjustment import adjust_poses, patch_term
+from biresnerf.refinement.adjustment.cameras import Cameras
+from biresnerf.refinement.adjustment.evidence import Patches, PosePrior, Positions
+from biresnerf.refinement.adjustment.lens.lenses import Lenses
+from biresnerf.refinement.adjustment.solver import covariance as covariances
+from biresnerf.refinement.adjustment.solver import dissection
+from biresnerf.refinement.adjustment.solver.blocks import Blocks
+from biresnerf.refinement.adjustment.solver.elimination import inverse_blocks, solution
+from biresnerf.refinement.adjustment.track_term import TrackTerm
+from biresnerf.refinement.finish.expected_errors import expected_errors
+from tests.refinement.adjustment.test_patch_adjustment import Plane
+
+CAMERAS = 40
+NUMBERS = np.arange(CAMERAS)
+LENS = np.array([0.02, 0.1, 0.1, 0.01, 0.01, 0.0, 0.0, 0.0])  # deviations; the last three are held
+FOCAL_ALONE = np.arange(8) == 0
+NONE = np.zeros(CAMERAS, np.bool_)
+LENSES = {
+    "a lens that all share": Lenses(0 * NUMBERS, np.zeros((1, 8)), LENS[None]),
+    "three lenses": Lenses(NUMBERS % 3, np.zeros((3, 8)), np.tile(LENS, (3, 1))),
+    "a lens of each camera": Lenses(
+        NUMBERS, np.zeros((CAMERAS, 8)), np.tile(LENS * FOCAL_ALONE, (CAMERAS, 1))
+    ),
+}
+BODIES = {
+    "rigs": RigidBodies(NUMBERS // 2, NONE),
+    "rigs far apart": RigidBodies(NUMBERS % (CAMERAS // 2), NONE),
+    "fixed cameras": RigidBodies(NUMBERS, NUMBERS % 13 == 5),
+    "a fixed rig": RigidBodies(NUMBERS // 2, NUMBERS // 2 == 7),
+}
+
+
+@pytest.fixture(name="fronts")
+def small_fronts(monkeypatch):
+    """Switches between one front and many."""
+
+    def switch(many):
+        monkeypatch.setattr(dissection, "ONE_FRONT", 0 if many else 10**6)
+        monkeypatch.setattr(dissection, "LEAF", 3)
+        monkeypatch.setattr(dissection, "TIED_TO_MANY", 0.6)
+        dissection._fronts.cache_clear()
+
+    yield switch
+    dissection._fronts.cache_clear()
+
+
+def linearised(given):
+    cameras = Cameras.of(given.truth, given.evidence.lenses)
+    term = TrackTerm(given.evidence.tracks, given.evidence.intrinsics, cameras, 0.5)
+    term.settle(cameras)
+    return cameras, term.linearise(cameras, 0.0)
+
+
+def in_both_ways(fronts, evidence, start, prior):
+    """Adjusted, with the expected errors, in one front and in many."""
+    found = []
+    for many in (False, True):
+        fronts(many)
+        result = adjust_poses(start, evidence, prior)
+        lenses = evidence.lenses and replace(evidence.lenses, correction=result.lenses.correction)
+        held = replace(evidence, lenses=lenses)
+        errors = expected_errors(result.world_from_cam, result.world_from_cam, held, bodies=prior.bodies)
+        found.append((result, errors.covariance))
+    return found
+
+
+def assert_same(one, many, tolerance=1e-6):
+    (dense, certain), (sparse, found) = one, many
+    np.testing.assert_allclose(sparse.world_from_cam, dense.world_from_cam, atol=1e-8)
+    assert sparse.track_noise_px == pytest.approx(dense.track_noise_px, rel=1e-8, nan_ok=True)
+    deviation = np.sqrt(np.maximum(np.diagonal(certain, axis1=1, axis2=2), 1e-20))
+    scale = deviation[:, :, None] * deviation[:, None, :]
+    assert np.isfinite(certain).all()
+    np.testing.assert_allclose(found / scale, certain / scale, atol=tolerance)
+    if dense.lenses is not None:
+        np.testing.assert_allclose(sparse.lenses.correction, dense.lenses.correction, atol=1e-8)
+        np.testing.assert_allclose(sparse.lenses.deviation, dense.lenses.deviation, rtol=1e-4)
+        np.testing.assert_array_equal(sparse.lenses.observable, dense.lenses.observable)
+
+
+def test_fronts_solve_what_the_dense_matrix_solves(fronts):
+    given = rig("corridor", CAMERAS)
+    _, linear = linearised(replace(given, evidence=replace(given.evidence, lenses=LENSES["three lenses"])))
+    system = linear.system.with_diagonal(np.ones(len(linear.right)))
+    free = np.arange(len(linear.right)) % 7 != 0
+    expected = np.zeros(len(free))
+    expected[free] = np.linalg.solve(system.dense()[np.ix_(free, free)], linear.right[free])
+    fronts(True)
+    assert len(dissection.fronts_of(system)) > 8
+    np.testing.assert_allclose(solution(system, linear.right, free), expected, rtol=1e-8, atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", ["ring", "aerial"])
+def test_uncertainties_of_300_cameras_are_those_of_the_dense_inverse(shape):
+    cameras, linear = linearised(rig(shape, 300))
+    assert len(dissection.fronts_of(linear.system)) > 8
+    common = covariances.common_motions(cameras, np.ones(300, np.bool_))
+    held = 1e6 * covariances.seen_aligning(common, np.ones(300, np.bool_))
+    system = linear.system.with_diagonal(np.ones(1800))
+    dense = np.linalg.inv(np.block([[system.dense(), held], [held.T, np.zeros((7, 7))]]))[:1800, :1800]
+    dense = dense.reshape(300, 6, 300, 6)[np.arange(300), :, np.arange(300)]
+    found = inverse_blocks(system, np.ones(1800, np.bool_), held)
+    np.testing.assert_allclose(
+        np.linalg.norm(found - dense, axis=(1, 2)) / np.linalg.norm(dense, axis=(1, 2)), 0, atol=1e-6
+    )
+
+
+def test_blocks_of_evidence_add_up(fronts):
+    given = rig("aerial", CAMERAS)
+    cameras, linear = linearised(given)
+    own = np.tile(np.diag([0, 0, 0, 1.0, 2, 3]), (2, 1, 1))
+    more = Blocks.of_cameras(cameras, np.array([3, 30]), own)
+    expected = linear.system.dense()
+    for camera in (3, 30):
+        expected[6 * camera : 6 * camera + 6, 6 * camera : 6 * camera + 6] += own[0]
+    for both in (linear.system + more, more + linear.system):
+        np.testing.assert_array_equal(both.dense(), expected)
+
+
+@pytest.mark.parametrize("shape", ["ring", "corridor", "aerial"])
+def test_cameras_end_where_the_dense_system_leads(fronts, shape):
+    given = rig(shape, CAMERAS)
+    assert_same(*in_both_ways(fronts, given.evidence, given.given, given.prior))
+
+
+@pytest.mark.parametrize("lenses", LENSES.values(), ids=LENSES.keys())
+def test_freed_lenses_end_where_the_dense_system_leads(fronts, lenses):
+    given = rig("aerial", CAMERAS)
+    evidence = replace(given.evidence, lenses=lenses)
+    assert_same(*in_both_ways(fronts, evidence, given.given, given.prior))
+
+
+@pytest.mark.parametrize("bodies", BODIES.values(), ids=BODIES.keys())
+def test_rigs_and_fixed_cameras_end_where_the_dense_system_leads(fronts, bodies):
+    given = rig("corridor", CAMERAS)
+    prior = replace(given.prior, bodies=bodies)
+    assert_same(*in_both_ways(fronts, given.evidence, given.truth, prior))
+
+
+def test_rigs_with_freed_lenses_end_where_the_dense_system_leads(fronts):
+    given = rig("corridor", CAMERAS)
+    prior = replace(given.prior, bodies=BODIES["rigs"])
+    evidence = replace(given.evidence, lenses=LENSES["three lenses"])
+    assert_same(*in_both_ways(fronts, evidence, given.truth, prior))
+
+
+def test_measured_positions_end_where_the_dense_system_leads(fronts):
+    given, rng = rig("aerial", CAMERAS), np.random.default_rng(1)
+    metres = 20 * given.truth[:, :3, 3] + rng.normal(0, 0.1, (CAMERAS, 3))
+    positions = Positions.of(NUMBERS, metres, np.full((CAMERAS, 3), 0.1))
+    evidence = replace(given.evidence, positions=positions)
+    assert_same(*in_both_ways(fronts, evidence, given.given, given.prior))
+
+
+@pytest.mark.slow
+def test_patches_end_where_the_dense_system_leads(fronts):
+    plane = Plane(np.random.default_rng(5), cameras=16)
+    start = plane.truth.copy()
+    start[:, :3, 3] += np.random.default_rng(2).normal(0, 0.01, (16, 3))
+    evidence = plane.evidence(start)
+    every = evidence.patches
+    apart = (every.target - every.host[every.point]) % 16
+    near = np.isin(apart, [1, 15])
+    evidence = replace(
+        evidence,
+        patches=Patches(
+            every.host, every.rays, every.inverse_depth, every.point[near], every.target[near], every.photos
+        ),
+    )
+    fronts(True)
+    cameras = Cameras.of(start)
+    assert len(dissection.fronts_of(patch_term(cameras, evidence, 1.0).linearise(cameras, 0.0).system)) > 2
+    one, many = in_both_ways(fronts, evidence, start, PosePrior.equal(start, 0.02, 0.06))
+    assert one[0].agreement == many[0].agreement or many[0].agreement.apart_deg == pytest.approx(
+        one[0].agreement.apart_deg, rel=1e-5
+    )
+    assert_same(one, many)
