@@ -101,7 +101,7 @@ def judged(made, seed, relief_m, wrong):
     before, after = rig(alone), rig(found)
     sets = (with_control(points, each.cameras[0]) for each in (before, after))
     old, new = sets
-    favoured = _by_positions(old, before, after, new, ALL)
+    favoured = _by_positions(old, before, after, new, ALL, EvidenceNumbers())
     report = control_report(new, found.world_from_cam)
     return truth, alone, found, favoured, report
 

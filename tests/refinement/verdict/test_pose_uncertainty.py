@@ -81,7 +81,8 @@ def test_a_pose_that_its_own_matches_contradict_is_not_known(tmp_path, rng):
     run, _ = begun(tmp_path, rng)
     finish = adjusted(run)
     judgement = judge_poses(*run.parts)
-    known = known_of(run, finish, replace(judgement, contradicted=np.arange(VIEWS) == 3))
+    name = "contradicted_before" if judgement.verdict.returned == "input" else "contradicted"
+    known = known_of(run, finish, replace(judgement, **{name: np.arange(VIEWS) == 3}))
     assert [each.why_unknown for each in known] == [
         MATCHES_CONTRADICT if i == 3 else None for i in range(VIEWS)
     ]
