@@ -69,6 +69,15 @@ def test_a_set_of_names_holds_no_two_that_are_equal_folded(names: list[str]) -> 
     assert len(kept) == len(set(kept))
 
 
+@pytest.mark.parametrize("names", [("a", "a/b"), ("a/b", "a"), ("A/b", "a"), ("a", "A/b"), ("a/b/c", "a/B")])
+def test_no_file_has_the_name_of_a_folder(names: tuple[str, str]) -> None:
+    taken = NameSet()
+    taken.add(names[0])
+    with pytest.raises(InputError) as caught:
+        taken.add(names[1])
+    assert caught.value.code == "name_collision"
+
+
 def test_one_folder_takes_many_files() -> None:
     taken = NameSet()
     taken.add("a/b/1")
