@@ -4,7 +4,8 @@
     python -m tests.mutants --draw 20 --seed 3   # plant new ones; those that a test finds join faults.json
 
 Each fault changes one line of a copy of the tracked files. Its test runs there twice: with the line as it was, when it
-must pass, and with the fault, when it must fail or never end. Slow tests, and those that need a server, have no part.
+must pass (all tests in one process), and with the fault, when it must fail or never end. Slow tests, and those that
+need a server, have no part.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import argparse
 import os
 import random
+import re
 import shutil
 import subprocess
 import sys
@@ -82,48 +84,59 @@ def _copy_tracked(to: Path) -> None:
 
 
 def _planted(faults: Iterable[PlantedFault], copy: Path) -> Iterable[tuple[PlantedFault, Outcome]]:
-    passed: dict[str, bool] = {}
+    faults = tuple(faults)
+    green = _green({fault.test for fault in faults}, copy)
     for fault in faults:
-        outcome = _outcome(fault, copy, passed)
+        outcome = _outcome(fault, copy, green)
         print(
             f"{outcome}: {fault.file}: {fault.old.strip()} -> {fault.new.strip()} ({fault.test})", flush=True
         )
         yield fault, outcome
 
 
-def _outcome(fault: PlantedFault, copy: Path, passed: dict[str, bool]) -> Outcome:
+def _outcome(fault: PlantedFault, copy: Path, green: set[str]) -> Outcome:
     file = copy / fault.file
     if not file.exists():
         return "gone"
     source = file.read_text()
-    if source.split("\n").count(fault.old) != 1:
-        return "gone"
-    if fault.test not in passed:
-        passed[fault.test] = _passes(fault.test, copy)
-    if not passed[fault.test]:
-        return "no green test"
     lines = source.split("\n")
+    if lines.count(fault.old) != 1:
+        return "gone"
+    if fault.test not in green:
+        return "no green test"
     lines[lines.index(fault.old)] = fault.new
     file.write_text("\n".join(lines))
     try:
-        return "survived" if _passes(fault.test, copy) else "found"
+        run = _pytest(["-x", fault.test], copy, LONGEST_S)
     finally:
         file.write_text(source)
+    return "survived" if run is not None and run.returncode == 0 else "found"
 
 
-def _passes(test: str, copy: Path) -> bool:
-    """Whether the test passes in the copy; one that does not end fails."""
-    chosen = ["-x", "-n", "0", "-m", FAST, test]
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *chosen]
+def _green(tests: set[str], copy: Path) -> set[str]:
+    """Those of the tests, files or single ones, of which some part is fast, and all that is passes in the copy."""
+    run = _pytest(["-rA", "--continue-on-collection-errors", *sorted(tests)], copy, LONGEST_S * len(tests))
+    said = "" if run is None else run.stdout.decode()
+    told = re.findall(r"^(PASSED|FAILED|ERROR) (\S+)", said, re.MULTILINE)
+
+    def passes(test: str) -> bool:
+        words = {word for word, name in told if re.match(re.escape(test) + r"($|\[|::)", name)}
+        return words == {"PASSED"}
+
+    return set(filter(passes, tests))
+
+
+def _pytest(chosen: list[str], copy: Path, longest_s: float) -> subprocess.CompletedProcess[bytes] | None:
+    """What a run of the chosen tests in the copy said; None of one that does not end."""
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-n", "0", "-m", FAST, *chosen]
     # Bytecode knows a file by its time in whole seconds and its size: a fault could be overlooked.
     around = {**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
     try:
-        run = subprocess.run(
-            command, cwd=copy, env=around, capture_output=True, timeout=LONGEST_S, check=False
+        return subprocess.run(
+            command, cwd=copy, env=around, capture_output=True, timeout=longest_s, check=False
         )
     except subprocess.TimeoutExpired:
-        return False
-    return run.returncode == 0
+        return None
 
 
 if __name__ == "__main__":
