@@ -199,8 +199,8 @@ def test_poses_that_may_move_in_a_trial_improve(scene):
 def test_a_trial_has_decided_once_photos_clearly_prefer_poses_or_matches_agree_with_them(
     scores, explained, decided
 ):
-    assert start_module._decided(scores, explained) == decided
-    assert start_module._decided(scores[::-1], explained[::-1]) == decided
+    assert start_module._decided(scores, explained, SHORT.start) == decided
+    assert start_module._decided(scores[::-1], explained[::-1], SHORT.start) == decided
 
 
 @pytest.mark.slow
