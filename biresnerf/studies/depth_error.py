@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.synthetic.captures import PHONE_FROM_SCENE, TABLE_METRES, TABLE_SCENE, VASE
 from biresnerf.data.synthetic.scene import MADE_SCENE, SHAPES, render_shapes
+from biresnerf.data.synthetic.still_life import STILL_LIFE
 from biresnerf.geometry.similarity import Similarity, align_robust
 from biresnerf.refinement.optimise.renderer import Renderer
 from biresnerf.refinement.scene.scene import Scene
@@ -17,7 +18,12 @@ from biresnerf.refinement.views.evaluation import render_view
 _SAME = Similarity.identity()
 _IN_METRES = Similarity(TABLE_METRES, PHONE_FROM_SCENE[:3, :3], np.zeros(3))
 # By the name in the transforms file: the shapes, and where they lie in the world of the file's poses.
-_MADE = {"dome": (SHAPES, _SAME), "vase": (VASE, _SAME), "table": (TABLE_SCENE, _IN_METRES)}
+_MADE = {
+    "dome": (SHAPES, _SAME),
+    "still_life": (STILL_LIFE, _SAME),
+    "vase": (VASE, _SAME),
+    "table": (TABLE_SCENE, _IN_METRES),
+}
 
 
 def is_made(dataset: Dataset) -> bool:

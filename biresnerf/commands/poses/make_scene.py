@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 KINDS = {
     "dome": "cameras on a dome above textured shapes; each pose is turned at random",
+    "still-life": "the same cameras above wood, brick, marble and cloth in soft light; the images look like photos",
     "phone": "a phone's walk around a table; poses drift, focal length 1 % too long",
     "half": "the same walk as a COLMAP model that lacks half of the images",
     "vase": "a plain vase without background; each pose is turned at random",
@@ -62,8 +63,8 @@ class MadeScene:
 )
 @click.option(
     "--noise", type=click.FloatRange(0, 1), default=0.15, show_default=True,
-    help="Standard deviation of the pose noise, as in BARF, for dome, vase and panoramas; for turntable, share by "
-    "which its steps are uneven.",
+    help="Standard deviation of the pose noise, as in BARF, for dome, still-life, vase and panoramas; for turntable, "
+    "share by which its steps are uneven.",
 )  # fmt: skip
 @click.option(
     "--camera", type=click.Choice(CAMERAS),
@@ -142,6 +143,10 @@ def _made(output: Path, kind: str, views: int, size: int, noise: float, camera: 
         return write_turntable(output, views, size, seed, noise, MAKERS.get(camera))
     if kind == "panoramas":
         return write_panoramas(output, views, size, seed)
+    if kind == "still-life":
+        from biresnerf.data.synthetic.still_life import write_still_life
+
+        return write_still_life(output, views, size, seed, MAKERS.get(camera))
     write = {"dome": write_synthetic_scene, "vase": write_vase}.get(kind, write_walk)
     return write(output, views, size, seed, MAKERS.get(camera))
 

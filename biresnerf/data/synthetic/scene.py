@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,12 @@ SHAPES = (
     Shape("sphere", (-0.42, 0.31, 0.58), (0.25, 0.25, 0.25), (0.0, 0.0)),
     Shape("cylinder", (0.02, -0.04, 0.20), (0.13, 0.13, 0.62), (40.0, 32.0)),
 )
+
+
+class Coloured(Protocol):
+    """What a shape looks like: lit colours float32 [n, 3], 0 to 1, of points and normals [n, 3] in the world."""
+
+    def colour(self, points: NDArray[np.float32], normals: NDArray[np.float32], /) -> NDArray[np.float32]: ...
 
 
 def synthetic_cameras(n_views: int, seed: int) -> NDArray[np.float64]:
@@ -66,7 +73,7 @@ def random_textures(count: int, seed: int) -> list[Texture]:
 
 def render_shapes(
     shapes: Sequence[Shape],
-    textures: Sequence[Texture],
+    textures: Sequence[Coloured],
     world_from_cam: NDArray[np.float64],
     width: int,
     height: int,
@@ -122,7 +129,7 @@ def render_panorama(
 
 def _trace(
     shapes: Sequence[Shape],
-    textures: Sequence[Texture],
+    textures: Sequence[Coloured],
     origin: NDArray[np.float32],
     directions: NDArray[np.float32],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
