@@ -63,11 +63,11 @@ coverage: web  ## all tests with branch coverage, printed by file; in build/cove
 	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --maxprocesses 4 --dist loadfile --no-loadscope-reorder --cov --cov-report=term \
 	  --cov-report=html:build/coverage $(PYTEST)
 
-lint: setup  ## format, style, types, the direction of imports, and lengths of files and functions
+lint: setup  ## format, style, types, the direction of imports, lengths of files and functions, and turns of phrase
 	$(BIN)/ruff format --check . && $(BIN)/ruff check .
 	$(BIN)/mypy && $(BIN)/lint-imports
 	$(BIN)/python hatch_build.py --types
-	$(BIN)/python -m pytest -q -n 0 -p no:cacheprovider tests/test_limits.py
+	$(BIN)/python -m pytest -q -n 0 -p no:cacheprovider tests/test_limits.py tests/test_prose.py
 
 format: setup  ## rewrite the code in the project's format
 	$(BIN)/ruff format . && $(BIN)/ruff check --fix .

@@ -1,4 +1,4 @@
-"""Files of jobs that are sent to addresses of their owners: what is asked for, and what became of it."""
+"""Files of jobs that are sent to addresses of their owners: requests and their outcomes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What other libraries decode, as an image that Pillow opens: the size at once, the pixels when they are asked for."""
+"""What other libraries decode, as an image that Pillow opens: the size at once, the pixels on request."""
 
 from __future__ import annotations
 
