@@ -106,12 +106,19 @@ def refine_poses(
             yet where initial poses were still being looked for.
     """
     started, share = time.monotonic(), ProcessorShare()
-    folder = OutputFolder(Path(output), keep_reusable=keep_reusable)
+    title = _title_of(input.root) if isinstance(input, Dataset) else None
+    folder = OutputFolder(Path(output), keep_reusable=keep_reusable, title=title)
     if overwrite:
         folder.remove_result()
     with share.watching(), KernelCompilation() as kernels:
         setup = _set_up(folder, options, method, on_progress, should_stop, share, kernels)
         return _refine(input, setup, observer or Observer(), started)
+
+
+def _title_of(root: Path) -> str | None:
+    """The set's name, for its report; None of a folder whose name says nothing."""
+    name = root.resolve().name
+    return None if name in ("", "input", "images") else name
 
 
 def _refine(input: str | Path | Dataset, setup: _Setup, observer: Observer, started: float) -> Report:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import Field, computed_field, model_validator
 
 from biresnerf.errors import Fault
 from biresnerf.frozen_model import FrozenModel
@@ -169,6 +169,22 @@ class ImageReport(FrozenModel):
         None, description="Render against photo at working size, dB; held-out views only."
     )
     ssim: float | None = Field(None, description="As psnr; Gaussian window of 11 px, standard deviation 1.5.")
+
+    @computed_field(  # type: ignore[prop-decorator]  # mypy knows no decorated properties
+        description="Whether feature matches or the photo itself support the returned pose, and its matches do not "
+        "contradict it. None where its accuracy was not asked."
+    )
+    @property
+    def confirmed(self) -> bool | None:
+        if self.uncertainty is None:
+            return None
+        return self.uncertainty.why_unknown is None and not self.contradicted
+
+    @model_validator(mode="before")
+    @classmethod
+    def _follow_confirmed(cls, data: Any) -> Any:
+        """What files say of `confirmed` follows from the other fields."""
+        return {k: v for k, v in data.items() if k != "confirmed"} if isinstance(data, dict) else data
 
     @property
     def flags(self) -> tuple[str, ...]:

@@ -60,7 +60,11 @@ def test_pages_are_no_longer_than_they_may_be():
 
 
 def test_the_list_finds_what_it_names():
-    texts = {"told apart": "They are told apart by keys.", "mend": "how to mend it", "of (its": "has lenses of its own"}
+    texts = {
+        "told apart": "They are told apart by keys.",
+        "mend": "how to mend it",
+        "of (its": "has lenses of its own",
+    }
     for part, text in texts.items():
         pattern = next(each for each in LIST["better"] if part in each)
         assert re.search(pattern, text, re.IGNORECASE)

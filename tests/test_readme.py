@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from biresnerf.options.presets import PRESETS
 
@@ -57,3 +62,62 @@ def test_every_make_target_of_the_readme_exists():
     targets = set(re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), flags=re.M))
     named = set(re.findall(r"(?:^|`)make ([a-z]+)", (ROOT / "README.md").read_text(), flags=re.M))
     assert {"demo", "test"} <= named <= targets
+
+
+# Imports nothing but the distributions named on the command line, then runs the lines from standard input.
+ONLY_THESE = """
+import importlib.abc, importlib.metadata, sys
+allowed = set(sys.argv[1].split(","))
+owners = {}
+for module, names in importlib.metadata.packages_distributions().items():
+    owners[module] = {name.lower().replace("_", "-").replace(".", "-") for name in names}
+class Absent(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        owned = owners.get(name.partition(".")[0], set())
+        if owned and not owned & allowed:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+sys.meta_path.insert(0, Absent())
+import matplotlib
+matplotlib.use("Agg")
+exec(sys.stdin.read())
+"""
+
+
+def test_the_python_of_the_readme_runs_with_what_its_install_line_installs(tmp_path):
+    text = (ROOT / "README.md").read_text()
+    extras = re.search(r"pip install -c constraints.txt '\.\[([\w,]+)\]'", text)
+    assert extras is not None
+    code = next(block for block in re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL))
+    refined = re.compile(r"biresnerf\.refine\([^)]*\)")
+    assert refined.search(code)
+    # The page's finished example stands for the run, which tests/docs makes. It holds no COLMAP model.
+    code = code.replace('result.to_colmap("sparse")\n', "")
+    code = refined.sub(f"biresnerf.load({str(ROOT / 'service/example')!r})", code)
+    allowed = ",".join(sorted(distributions("biresnerf", set(extras.group(1).split(",")))))
+    command = [sys.executable, "-c", ONLY_THESE, allowed]
+    done = subprocess.run(command, input=code, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "improved" in done.stdout
+
+
+def distributions(name: str, extras: set[str]) -> set[str]:
+    """The names of all that pip would install for a distribution with these extras, itself included."""
+    found, waiting = {canonicalize_name(name)}, [(name, extras)]
+    while waiting:
+        one, wanted = waiting.pop()
+        for line in importlib.metadata.requires(one) or []:
+            needed = Requirement(line)
+            chosen = (
+                [needed.marker.evaluate({"extra": extra}) for extra in (*wanted, "")]
+                if needed.marker
+                else [True]
+            )
+            key = canonicalize_name(needed.name)
+            if any(chosen) and (key not in found or needed.extras):
+                found.add(key)
+                try:
+                    waiting.append((needed.name, set(needed.extras)))
+                    importlib.metadata.requires(needed.name)
+                except importlib.metadata.PackageNotFoundError:
+                    waiting.pop()
+    return found

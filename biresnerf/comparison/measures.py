@@ -14,14 +14,21 @@ import numpy as np
 from biresnerf.arrays import Array
 from biresnerf.comparison.conclusion import ComparedFigure, Side
 from biresnerf.data.formats.simple.poses_json import PosesDocument
-from biresnerf.judging.compare import FITS_BELOW, MATCH_ERRORS, UNSEEN_PSNR, compare, octaves
+from biresnerf.judging.compare import (
+    FITS_BELOW,
+    MATCH_ERRORS,
+    PHOTOS_CONFIRMED,
+    STATED_ACCURACY,
+    UNSEEN_PSNR,
+    compare,
+    octaves,
+)
 from biresnerf.report import Finding, ImageReport, Report, Verdict
 
 FEWEST = 3  # photos that a measure needs in both results
 SIMILAR_MATCHES = 2.0  # sets of feature matches that differ by more than this factor are no common measure
-CONFIRMED_MATTERS = 0.05  # share of the photos
-EXACT_MATTERS = 1.25  # ratio of the stated accuracies
 LEAST_PX = 1e-3  # of a matching error, which may be zero on made scenes
+LEAST_DEG = 1e-4  # of a stated accuracy
 MATCHES, VIEWS = "Fit of feature matches", "Unseen views"
 CONFIRMED, EXACT = "Photos confirmed", "Poses exact to"
 NONE = "–"
@@ -133,18 +140,15 @@ def _confirmed(pairs: _Pairs) -> ComparedFigure | None:
     texts = [NONE if count is None else f"{count} of {len(pairs)}" for count in counts]
     if counts[0] is None or counts[1] is None:
         return _without(CONFIRMED, texts, "only one result says which photos are")
-    more = counts[0] - counts[1]
-    side: Side = "same" if abs(more) < CONFIRMED_MATTERS * len(pairs) else "first" if more > 0 else "second"
-    return ComparedFigure(
-        name=CONFIRMED, first=texts[0], second=texts[1], better="same" if more == 0 else side
-    )
+    gains = np.array([float(bool(one.confirmed)) - float(bool(other.confirmed)) for one, other in pairs])
+    side = _SIDES[compare(gains, PHOTOS_CONFIRMED).finding]
+    return ComparedFigure(name=CONFIRMED, first=texts[0], second=texts[1], better=side)
 
 
 def _count(images: tuple[ImageReport, ...]) -> int | None:
     """How many photos matches or the photo itself confirm; None where nothing was said of any."""
-    told = [image for image in images if image.uncertainty is not None]
-    confirmed = [i for i in told if i.uncertainty and not i.uncertainty.why_unknown and not i.contradicted]
-    return len(confirmed) if told else None
+    told = [image.confirmed for image in images if image.confirmed is not None]
+    return sum(told) if told else None
 
 
 def _exact(pairs: _Pairs) -> ComparedFigure | None:
@@ -155,10 +159,7 @@ def _exact(pairs: _Pairs) -> ComparedFigure | None:
             for side in zip(*pairs, strict=True)
         ] or [np.zeros(0)] * 2
         return _without(EXACT, [_text(side, "°") for side in sides], "not both results state it")
-    typical = [float(np.median(side)) for side in values]
-    side: Side = "same"
-    if max(typical) > EXACT_MATTERS * min(typical):
-        side = "first" if typical[0] < typical[1] else "second"
+    side = _SIDES[compare(octaves(values[1], values[0], LEAST_DEG), STATED_ACCURACY).finding]
     return ComparedFigure(name=EXACT, first=_text(values[0], "°"), second=_text(values[1], "°"), better=side)
 
 

@@ -24,7 +24,7 @@ class Option:
         title: its name in forms and tables.
         changes_result: whether poses, field or verdict depend on it. Other options may change when a run resumes.
         level: main: what forms show first; usual: for every user; expert: for users who know the method; research: for
-            experiments with the method, left out of forms.
+            experiments with the method; forms show the learning rates alone, last.
         smaller: from the value of a try that ran out of memory to that of the next; None if it saves none.
     """
 

@@ -76,7 +76,11 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
         AUTO, description="Where to compute; auto: on a CUDA GPU if there is one."
     )
     seed: Annotated[int, Option("seeding", "Random seed", level="usual")] = Field(
-        0, ge=0, lt=2**31, description="On one CPU the same seed gives the same result."
+        0,
+        ge=0,
+        lt=2**31,
+        description="On one CPU the same seed gives the same result, unless COLMAP maps photos: its threads "
+        "make it differ from run to run.",
     )
     threads: Annotated[int, Option("coarse", "CPU threads", changes_result=False)] = Field(
         0, ge=0, le=256, description="CPU threads; 0: all cores that the process may use."
@@ -94,7 +98,8 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
         OPEN, description="Views excluded from training, to measure quality; auto: a tenth, at most 10."
     )
     background: Annotated[Background, Option("coarse", "Background", level="usual")] = Field(
-        "auto", description="Colour behind the scene; none: photos show surroundings; auto: detected."
+        "auto",
+        description="Colour behind the scene. none: photos show surroundings; auto: the colour is detected.",
     )
     exposure: Annotated[ExposureChoice | Open, Option("coarse", "Exposure", level="usual")] = Field(
         OPEN,
@@ -159,7 +164,7 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
         description="How exact the given positions are: standard deviation along each axis, in the input's unit; 0: "
         "measured.",
     )
-    known_distance: Annotated[str, Option("fine", "Scale", level="usual", changes_result=False)] = Field(
+    known_distance: Annotated[str, Option("fine", "Scale", level="main", changes_result=False)] = Field(
         "",
         max_length=1000,
         description="Two photos, or two points of the input's world, and the metres between them; gives the scale: "
@@ -191,17 +196,17 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
     ] = Field(
         OPEN, ge=1024, le=2**22, description="Field samples per step at the end of the coarse-to-fine ramp."
     )
-    pose_rate: Annotated[float | Open, Option("coarse", "Pose rate at the start")] = Field(
+    pose_rate: Annotated[float | Open, Option("coarse", "Pose rate at the start", level="research")] = Field(
         OPEN, gt=0, le=0.1, description="Pose learning rate at the start."
     )
-    pose_rate_final: Annotated[float | Open, Option("coarse", "Pose rate at the end")] = Field(
-        OPEN, gt=0, le=0.1, description="Pose learning rate at the end."
+    pose_rate_final: Annotated[float | Open, Option("coarse", "Pose rate at the end", level="research")] = (
+        Field(OPEN, gt=0, le=0.1, description="Pose learning rate at the end.")
     )
-    field_rate: Annotated[float | Open, Option("coarse", "Field rate at the start")] = Field(
-        OPEN, gt=0, le=0.5, description="Field learning rate at the start."
+    field_rate: Annotated[float | Open, Option("coarse", "Field rate at the start", level="research")] = (
+        Field(OPEN, gt=0, le=0.5, description="Field learning rate at the start.")
     )
-    field_rate_final: Annotated[float | Open, Option("coarse", "Field rate at the end")] = Field(
-        OPEN, gt=0, le=0.5, description="Field learning rate at the end."
+    field_rate_final: Annotated[float | Open, Option("coarse", "Field rate at the end", level="research")] = (
+        Field(OPEN, gt=0, le=0.5, description="Field learning rate at the end.")
     )
     warmup_steps: Annotated[int | Open, Option("fine", "Warm-up steps", level="research")] = Field(
         OPEN,
@@ -260,7 +265,7 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
         "twentieth of the run.",
     )
     exports: Annotated[
-        Exports, Option("exporting", "Further formats", level="usual", changes_result=False)
+        Exports, Option("exporting", "Further formats", level="main", changes_result=False)
     ] = Field(
         (),
         description="Further formats to write the result in; pinhole: undistorted photos with a PINHOLE model.",

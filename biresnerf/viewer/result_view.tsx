@@ -29,7 +29,7 @@ export function ResultView({ poses, report, view, points, history, urlOf }: Prop
       </div>
       <div class="job-pictures compared">
         <div class="panel panel-compare">
-          <h2>Before and after</h2>
+          <h2>Result</h2>
           <ImageCompare names={names} views={view?.views ?? []} centres={centres} urlOf={urlOf} {...choice} />
         </div>
         <div class="panel panel-scene">

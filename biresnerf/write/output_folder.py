@@ -25,10 +25,11 @@ class OutputFolder:
 
     Args:
         keep_reusable: leave behind what other runs of the set can start from.
+        title: heading of report.html.
     """
 
-    def __init__(self, path: Path, *, keep_reusable: bool = False) -> None:
-        self.path, self._keep_reusable = Path(path), keep_reusable
+    def __init__(self, path: Path, *, keep_reusable: bool = False, title: str | None = None) -> None:
+        self.path, self.title, self._keep_reusable = Path(path), title, keep_reusable
 
     @property
     def preview(self) -> Path:

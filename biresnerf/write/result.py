@@ -98,7 +98,7 @@ def write_result(
     _write_view_file(path, scene, evaluation, moved or result, surface, poses)
     doubts = tuple(each.doubt for each in (reference, control) if each is not None and each.doubt)
     report = report.model_copy(update={"warnings": (*report.warnings, *doubts)})
-    notes = write_report_html(path, report)
+    notes = write_report_html(path, report, folder.title)
     for note in notes:
         logger.warning("%s", note)
     report = report.model_copy(update={"warnings": report.warnings + notes})

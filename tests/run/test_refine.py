@@ -38,6 +38,7 @@ def test_the_result_is_what_lies_in_the_folder(scene, tmp_path):
     assert result.report.options.steps == 40
     assert [p.fraction for p in told] == sorted(p.fraction for p in told)
     assert told[-1].fraction == 1.0
+    assert f"<title>{scene.name}</title>" in (tmp_path / "out/report.html").read_text("utf-8")
 
 
 @pytest.mark.parametrize(

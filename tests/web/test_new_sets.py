@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -44,7 +45,7 @@ def test_a_sample_set_is_one_click_away(page: Page, service: Running) -> None:
     expect(check_row(page, "Images")).to_contain_text("24 images")
     times = page.locator(".preset-time")
     expect(times).to_have_count(4)
-    expect(times.first).to_have_text(re.compile(r"about \d+( s)?( to \d+)? (s|min|h) here"))
+    expect(times.first).to_have_text(re.compile(r"about \d+( s)?( to \d+)? (s|min|h)"))
     expect(page.get_by_role("button", name="Refine the poses")).to_be_visible()
     # It waits in the list, with its first photo, until its job is started.
     page.goto(service.url)
@@ -68,11 +69,15 @@ def test_a_finished_example_is_one_click_away_and_needs_no_job(
     expect(page.get_by_role("region", name="Table of images").get_by_role("row")).to_have_count(
         len(report.images) + 1
     )
+    with page.expect_download() as coming:
+        page.get_by_role("link", name="transforms.json").click()
+    frames = json.loads(Path(coming.value.path()).read_text("utf-8"))["frames"]
+    assert len(frames) == len(report.images)
     expect(page.get_by_role("application")).to_be_visible()
     page.wait_for_function(
         "() => [...document.querySelectorAll('.compare-frame img')].filter(e => e.naturalWidth > 0).length >= 2"
     )
-    page.get_by_role("slider", name="Swipe between before and after").press("Home")
+    page.get_by_role("slider", name="Swipe between photo and render").press("Home")
     expect(page.locator(".curves canvas").first).to_be_visible()
     tab.screenshot("example")
     assert tab.findings() == []
@@ -84,7 +89,7 @@ def test_who_has_no_job_yet_sees_what_comes_of_one(tab: Watched, service: Runnin
     page = tab.page
     page.route("**/v1/jobs?*", lambda route: route.fulfill(json={"items": [], "next_cursor": None}))
     page.goto(service.url)
-    shown = page.get_by_role("region", name="What comes of it")
+    shown = page.get_by_role("region", name="Example result")
     for words in ("given poses", "refined poses", "photo"):
         expect(shown.get_by_text(words, exact=True)).to_be_visible()
     page.wait_for_function(
@@ -110,7 +115,7 @@ def test_a_checked_set_shows_its_photos_and_cameras_and_leaves_photos_out(
     )
     plan = page.get_by_role("region", name="What will happen")
     expect(plan).to_contain_text("Your poses are the start.")
-    expect(plan).to_contain_text(re.compile(r"about \d+( s)?( to \d+)? (s|min|h) on this machine"))
+    expect(plan).to_contain_text(re.compile(r"about \d+( s)?( to \d+)? (s|min|h)"))
     stage, shown = page.get_by_role("application"), page.get_by_role("checkbox", name="Photos", exact=True)
     shown.uncheck()
     bare = stage.screenshot()
@@ -122,7 +127,7 @@ def test_a_checked_set_shows_its_photos_and_cameras_and_leaves_photos_out(
     expect(photos.nth(3)).to_have_attribute("aria-pressed", "true")
     tab.screenshot("checked-set")
     assert tab.findings_in_each_look() == []
-    expect(page.locator(".field:visible")).to_have_count(4)
+    expect(page.locator(".field:visible")).to_have_count(6)
     page.get_by_text("More options").click()
     distance = "./train/r_1, ./train/r_2, 0.5"
     page.get_by_label("Scale", exact=True).fill(distance)
@@ -131,8 +136,36 @@ def test_a_checked_set_shows_its_photos_and_cameras_and_leaves_photos_out(
     job = sent.value.json()
     chosen = {"leave_out": ["./train/r_3"], "known_distance": distance}
     assert job["options"] == {"preset": "fast", **chosen}
+    # While nothing is computed yet, the job shows the photos and the given cameras.
+    expect(page.get_by_role("list", name="Photos of the set").get_by_role("listitem")).to_have_count(10)
+    expect(page.get_by_text("The given cameras.")).to_be_visible()
+    expect(page.get_by_role("application")).to_have_attribute(
+        "aria-label", re.compile("^Picture of 10 cameras")
+    )
+    assert tab.findings() == []
     api.post(f"/jobs/{job['id']}/cancel")
     assert tab.complaints == []
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 800), (390, 844)])
+def test_presets_their_times_and_the_button_are_seen_without_scrolling(
+    tab: Watched, service: Running, kitchen: Path, width: int, height: int
+) -> None:
+    page = tab.page
+    page.set_viewport_size({"width": width, "height": height})
+    page.goto(service.url)
+    drop(page, kitchen)
+    expect(page.locator(".preset-time")).to_have_count(4)
+    button = page.get_by_role("button", name="Refine the poses")
+    for shown in (
+        *page.get_by_role("group", name="Preset").get_by_role("radio").all(),
+        *page.locator(".preset-time").all(),
+        button,
+    ):
+        box = shown.bounding_box()
+        assert box is not None
+        assert box["y"] + box["height"] <= height
+    tab.screenshot(f"check-{width}")
 
 
 def test_poses_that_seem_to_mean_something_else_are_converted_with_a_click(
@@ -144,7 +177,10 @@ def test_poses_that_seem_to_mean_something_else_are_converted_with_a_click(
     drop(page, tmp_path / "cv")
     question = page.get_by_role("region", name="Convert the poses?")
     expect(question).to_contain_text("seem to have OpenCV's axes")
-    expect(question).to_contain_text("They are used as they are.")
+    expect(question).to_contain_text("They are used unchanged.")
+    box = question.get_by_role("button", name="Convert").bounding_box()
+    assert box is not None
+    assert box["y"] + box["height"] <= 800
     stage = page.get_by_role("application")
     page.get_by_role("checkbox", name="Photos", exact=True).uncheck()
     given = stage.screenshot()

@@ -66,7 +66,10 @@ def test_the_slider_goes_from_the_inputs_poses_to_the_refined_ones(
 def test_the_swipe_uncovers_the_view_before_and_the_photo(desktop: Watched, done: dict[str, Any]) -> None:
     page = desktop.page
     frame = page.locator(".compare-frame")
-    for mode, left, right in (("before | after", "before", "after"), ("photo | render", "photo", "render")):
+    for mode, left, right in (
+        ("test: given | refined", "given poses", "refined poses"),
+        ("photo | render", "photo", "render"),
+    ):
         page.get_by_role("radio", name=mode).check()
         swipe = page.get_by_role("slider", name=f"Swipe between {left} and {right}")
         swipe.press("Home")
@@ -104,11 +107,37 @@ def test_ticked_images_are_held_or_left_out_in_another_run(desktop: Watched, don
 def test_the_verdict_is_the_reports(desktop: Watched, done: dict[str, Any], api: httpx.Client) -> None:
     said = api.get(f"/jobs/{done['id']}/report").json()["verdict"]
     assert said["verdict"] == done["verdict"]
-    shown = desktop.page.get_by_role("region", name="Verdict").inner_text()
+    region = desktop.page.get_by_role("region", name="Verdict")
+    shown = region.inner_text()
     assert {"improved": "improved", "kept_input": "not improved"}.get(
         said["verdict"], said["verdict"]
     ).lower() in shown.lower()
     desktop.screenshot("job-done")
+
+
+def test_a_result_leads_with_how_exact_it_is_and_how_many_photos_are_confirmed(
+    desktop: Watched, done: dict[str, Any], api: httpx.Client
+) -> None:
+    images = api.get(f"/jobs/{done['id']}/artifacts/report.json").json()["images"]
+    confirmed = sum(bool(image["confirmed"]) for image in images)
+    known = any(image["uncertainty"]["rotation_deg"] is not None for image in images)
+    region = desktop.page.get_by_role("region", name="Verdict")
+    names = [text for text in region.locator("dt").all_inner_texts() if text]
+    assert names[: 1 + known] == ["Poses exact to", "Photos confirmed"][1 - known :]
+    expect(region.locator(".figures > div", has_text="Photos confirmed")).to_contain_text(
+        f"{confirmed} of {len(images)}"
+    )
+    for researchers in ("Cameras turned by", "Refined cameras differ by", "Final render"):
+        expect(region.get_by_text(researchers, exact=True)).to_be_hidden()
+
+
+def test_a_result_shows_its_render_first_and_not_a_trials(desktop: Watched, done: dict[str, Any]) -> None:
+    page = desktop.page
+    page.reload()
+    expect(page.get_by_role("radio", name="photo | render")).to_be_checked()
+    page.wait_for_function("() => document.querySelector('.compare-frame img')?.naturalWidth > 0")
+    words = [image.get_attribute("alt") or "" for image in page.locator(".compare-frame img").all()]
+    assert [text.split(" ./")[0] for text in words] == ["Render of", "Photo"]
 
 
 def test_downloads_are_the_artifacts_to_the_byte(desktop: Watched, digests: dict[str, str]) -> None:
@@ -174,7 +203,7 @@ def test_all_of_it_can_be_reached_by_keyboard(desktop: Watched, done: dict[str, 
         "Run again …",
         "Delete",
         "From the input's poses to the refined ones",
-        "Swipe between before and after",
+        "Swipe between photo and render",
     }
     assert wanted <= names, names
     page.get_by_role("button", name="Delete").press("Enter")
@@ -193,11 +222,14 @@ def test_a_phone_shows_the_same_without_scrolling_sideways(
     phone: Watched, job_url: str, done: dict[str, Any], service: Running
 ) -> None:
     page = phone.page
+    page.goto(service.url)
+    expect(page.locator(".drop-buttons .act", has_text="Choose photos or a video")).to_be_visible()
+    expect(page.get_by_text("anywhere on this page")).to_be_hidden()
     for name, url in (("phone-job", job_url), ("phone-jobs", service.url)):
         page.goto(url)
         expect(page.get_by_text("kitchen").first).to_be_visible()
         if name == "phone-job":
-            expect(page.get_by_role("slider", name="Swipe between before and after")).to_be_visible()
+            expect(page.get_by_role("slider", name="Swipe between photo and render")).to_be_visible()
             expect(page.locator(".curves canvas").first).to_be_visible()
         phone.screenshot(name)
         assert not phone.overflows(), name

@@ -18,21 +18,23 @@ interface ImageCompareProps {
 
 type PictureKind = keyof ShownPictures;
 const MODES = [
-  { value: "refined", text: "before | after" },
   { value: "swipe", text: "photo | render" },
+  { value: "refined", text: "test: given | refined" },
   { value: "difference", text: "difference" },
   { value: "depth", text: "depth" },
 ] as const;
 type Mode = (typeof MODES)[number]["value"];
 /** The two pictures of a swipe, left and right. */
 const SWIPES = { refined: ["before", "after"], swipe: ["photo", "render"] } as const;
-const WORDS = { photo: "Photo", render: "Render of", before: "Render before refinement of", after: "Render after refinement of" };
+const WORDS = { photo: "Photo", render: "Render of", before: "Render with the given poses of", after: "Render with the refined poses of" };
+/** As they stand on the pictures: the last two are of the verdict's short trainings, not of the result. */
+const TAGS = { photo: "photo", render: "render", before: "given poses", after: "refined poses" };
 const NEAR = 3;
 
 export function ImageCompare({ names, views, centres, urlOf, selected, onSelect }: ImageCompareProps) {
-  const [chosen, setMode] = useState<Mode>("refined");
+  const [chosen, setMode] = useState<Mode>("swipe");
   const view = views.find((one) => one.image === selected);
-  const modes = view?.pictures.before ? MODES : MODES.slice(1);
+  const modes = view?.pictures.before ? MODES : MODES.filter(({ value }) => value !== "refined");
   const mode = modes.some(({ value }) => value === chosen) ? chosen : "swipe";
   const shown = useMemo(() => views.map((one) => one.image).sort((a, b) => a - b), [views]);
   if (views.length === 0) {
@@ -86,13 +88,13 @@ function Picture(props: { view: ShownView; name: string; mode: Mode; urlOf: Imag
           {picture(right, `${WORDS[right]} ${name}`)}
           {picture(left, `${WORDS[left]} ${name}`, { clipPath: `inset(0 ${100 * (1 - at)}% 0 0)` })}
           <span class="compare-tag compare-left" aria-hidden="true">
-            {left}
+            {TAGS[left]}
           </span>
           <span class="compare-tag compare-right" aria-hidden="true">
-            {right}
+            {TAGS[right]}
           </span>
           <span class="compare-edge" style={{ left: `${100 * at}%` }} aria-hidden="true" />
-          <Slider value={at} label={`Swipe between ${left} and ${right}`} text={`${Math.round(100 * at)} % ${left}`} onChange={setAt} />
+          <Slider value={at} label={`Swipe between ${TAGS[left]} and ${TAGS[right]}`} text={`${Math.round(100 * at)} % ${TAGS[left]}`} onChange={setAt} />
         </div>
       ) : (
         <div class="compare-frame" style={frame}>
@@ -104,7 +106,7 @@ function Picture(props: { view: ShownView; name: string; mode: Mode; urlOf: Imag
         {mode === "difference" && <Key left="equal" right="a quarter of the full range or more" />}
         {mode === "depth" && <Key left="far" right="near" />}
         {mode === "refined" ? (
-          <span>A view that neither model saw in training, rendered with the poses before and after refinement.</span>
+          <span>The verdict's test: two short trainings, one with the given poses and one with the refined ones. Neither saw this view.</span>
         ) : (
           <span>
             PSNR <b>{fixed(view.psnr, 2)} dB</b> at {view.width} × {view.height} px,{" "}

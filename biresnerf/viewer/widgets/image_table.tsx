@@ -65,7 +65,7 @@ export function ImageTable({ rows, selected, onSelect, cellOf, ticked, onTick }:
   const [text, setText] = useState("");
   const [kind, setKind] = useState("");
   const [all, setAll] = useState(false);
-  const columns = useMemo(() => COLUMNS.filter((column) => rows.some((row) => column.value(row) !== null)), [rows]);
+  const columns = useMemo(() => COLUMNS.filter((column) => 2 * rows.filter((row) => column.value(row) !== null).length >= rows.length), [rows]);
   const kinds = useMemo(() => [...new Set(rows.flatMap((row) => row.flags))].sort(), [rows]);
   const sources = useMemo(() => [...new Set(rows.map((row) => row.source))].sort(), [rows]);
   const most = useMemo(() => Math.max(1e-9, ...rows.map((row) => row.moved_deg)), [rows]);

@@ -38,15 +38,7 @@ export function ResultSummary({ report, rows, cellOf, onSelect, actionsOf }: Res
         </ul>
       )}
       <VerdictSentence report={report} />
-      <dl class="figures">
-        {figuresOf(report, rows).map(({ name, value, note }) => (
-          <div key={name}>
-            <dt>{name}</dt>
-            <dd>{value}</dd>
-            <dd class="soft">{note}</dd>
-          </div>
-        ))}
-      </dl>
+      <FigureList figures={figuresOf(report, rows)} />
       {report.warnings.length > 0 && (
         <ul class="warnings" aria-label="Warnings">
           {report.warnings.map((warning) => (
@@ -68,7 +60,25 @@ export function ResultSummary({ report, rows, cellOf, onSelect, actionsOf }: Res
         </div>
       )}
       <Evidence verdict={report.verdict} />
+      <details class="evidence">
+        <summary>More figures</summary>
+        <FigureList figures={moreFiguresOf(report, rows)} />
+      </details>
     </section>
+  );
+}
+
+function FigureList({ figures }: { figures: readonly Figure[] }) {
+  return (
+    <dl class="figures">
+      {figures.map(({ name, value, note }) => (
+        <div key={name}>
+          <dt>{name}</dt>
+          <dd>{value}</dd>
+          <dd class="soft">{note}</dd>
+        </div>
+      ))}
+    </dl>
   );
 }
 
@@ -102,35 +112,56 @@ interface Figure {
   readonly note: string;
 }
 
-/** What a person asks first: how sure, how far, how exact, how many, how well it renders. */
+/** What a person asks first: how exact, how many, and by what it was seen. */
 function figuresOf(report: Report, rows: readonly ImageRow[]): Figure[] {
-  const confirmed = rows.filter(({ flags }) => !flags.includes("uncertainty") && !flags.includes("contradicted")).length;
-  const turned = rows.map((row) => row.moved_deg);
+  const known = report.images.filter(({ confirmed }) => confirmed != null);
   const bounds = rows.flatMap(({ rotation_90 }) => (rotation_90 === null ? [] : [rotation_90]));
-  const positions = rows.flatMap(({ position_90 }) => (position_90 === null ? [] : [position_90]));
   const error = report.verdict?.epipolar?.error_px;
   const gain = report.verdict?.heldout?.psnr;
+  return [
+    ...(bounds.length ? [{ name: "Poses exact to", value: `± ${short(median(bounds), 2)}°`, note: positionWords(report, rows) }] : []),
+    ...(known.length
+      ? [
+          {
+            name: "Photos confirmed",
+            value: `${known.filter(({ confirmed }) => confirmed).length} of ${rows.length}`,
+            note: "by matches or by the photo itself",
+          },
+        ]
+      : []),
+    ...(error
+      ? [{ name: "Matching error", value: `${short(error.before, 2)} → ${short(error.after, 2)} px`, note: "typical, in full-size photos" }]
+      : []),
+    ...(gain ? [{ name: "Unseen views gain", value: `${signed(gain.difference, 1)} dB`, note: sureWords(gain) }] : []),
+  ];
+}
+
+/** How exact positions are: in percent of the cameras' distance, or in metres where they are known. */
+function positionWords(report: Report, rows: readonly ImageRow[]): string {
+  const shares = report.images.flatMap(({ uncertainty }) => uncertainty?.position_percent ?? []);
+  const positions = rows.flatMap(({ position_90 }) => (position_90 === null ? [] : [position_90]));
+  const metres = report.known_scale?.metres_per_unit ?? null;
+  const position =
+    metres !== null && positions.length
+      ? `${short(metres * median(positions)!, 2)} m`
+      : shares.length
+        ? `${short(median(shares), 2)} % of the distance`
+        : positions.length
+          ? `${short(median(positions), 2)} units`
+          : null;
+  return position === null ? "nine times in ten" : `and ± ${position}, nine times in ten`;
+}
+
+/** What tells of the run rather than of the poses. */
+function moreFiguresOf(report: Report, rows: readonly ImageRow[]): Figure[] {
+  const turned = rows.map((row) => row.moved_deg);
   const kept = (report.verdict ?? report.verdict_so_far)?.returned === "input";
   return [
-    ...(gain ? [{ name: "Unseen views gain", value: `${signed(gain.difference, 1)} dB`, note: sureWords(gain) }] : []),
     {
       name: kept ? "Refined cameras differ by" : "Cameras turned by",
       value: `${short(median(turned), 2)}°`,
       note: `typical; ${short(Math.max(...turned), 2)}° at most`,
     },
-    ...(error
-      ? [{ name: "Matching error", value: `${short(error.before, 2)} → ${short(error.after, 2)} px`, note: "typical, in full-size photos" }]
-      : []),
-    ...(bounds.length
-      ? [
-          {
-            name: "Poses exact to",
-            value: `± ${short(median(bounds), 2)}°`,
-            note: positions.length ? `and ± ${short(median(positions), 2)} units, nine times in ten` : "nine times in ten",
-          },
-        ]
-      : []),
-    { name: "Photos confirmed", value: `${confirmed} of ${rows.length}`, note: "by matches or by the photo itself" },
     ...(report.heldout
       ? [{ name: "Final render", value: `${fixed(report.heldout.psnr, 1)} dB`, note: `PSNR of ${count(report.heldout.count, "unseen view")}` }]
       : []),
@@ -140,5 +171,5 @@ function figuresOf(report: Report, rows: readonly ImageRow[]): Figure[] {
 /** How sure a gain in PSNR is. */
 function sureWords({ low, high, count: views }: PairedDifference): string {
   const test = `in the test on ${count(views, "view")}`;
-  return low === null || high === null ? test : `${signed(low, 1)} to ${signed(high, 1)} dB (95 % sure), ${test}`;
+  return low === null || high === null ? test : `${signed(low, 1)} to ${signed(high, 1)} dB (95 % interval), ${test}`;
 }

@@ -10,6 +10,7 @@ from PIL import Image
 from biresnerf.data.show.history import HISTORY
 from biresnerf.data.show.view_file import ShownView, read_view_file, write_view_file
 
+DOWNLOADS = ("transforms.json",)  # beside poses.json
 SHOWN, QUALITY = 4, 85  # views, and JPEG quality of their pictures
 
 
@@ -18,7 +19,14 @@ def keep_example(result: Path, example: Path) -> None:
     shutil.rmtree(example, ignore_errors=True)
     view = read_view_file(result)
     sheet = [view.contact_sheet.file] if view.contact_sheet else []
-    for name in (view.poses, "report.json", HISTORY, *sheet, *(points.file for points in view.points)):
+    for name in (
+        view.poses,
+        *DOWNLOADS,
+        "report.json",
+        HISTORY,
+        *sheet,
+        *(points.file for points in view.points),
+    ):
         (example / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(result / name, example / name)
     views = tuple(_with_small_pictures(one, result, example) for one in view.views[:SHOWN])

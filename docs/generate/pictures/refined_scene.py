@@ -1,93 +1,90 @@
-"""The pictures of the README: `python -m docs.generate.pictures.refined_scene` refines a made scene and draws what came of it.
+"""The other pictures of the README: `python -m docs.generate.pictures.refined_scene` refines a made still life.
 
-Takes some minutes. Writes the pictures of the README, docs/pictures/cameras.webp and before_after.webp.
+Takes about ten minutes. Writes docs/pictures/before_after.webp and flight.webp.
 """
 
 from __future__ import annotations
 
-import io
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
-import matplotlib
-import matplotlib.pyplot as plt
+import imageio.v2 as imageio
 import numpy as np
-from PIL import Image, ImageDraw
-from scipy.spatial.transform import Rotation
+from PIL import Image, ImageDraw, ImageFont
 
 import biresnerf
 from biresnerf.arrays import Array
 from biresnerf.commands.poses.make_scene import make_scene
 from biresnerf.data.show.view_file import read_view_file
+from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.result import Result
 
 FOLDER = Path(__file__).resolve().parents[2] / "pictures"
-CAMERAS, BEFORE_AFTER = PICTURES = (FOLDER / "cameras.webp", FOLDER / "before_after.webp")
-VIEWS, SIZE, NOISE, SEED = 48, 200, 0.15, 3
-MOVING, STILL, FRAME_MS = 24, 12, 60  # frames, and how long each is seen
-SIDE, GAP, CAPTION = 220, 8, 22  # px
+BEFORE_AFTER, FLIGHT = PICTURES = (FOLDER / "before_after.webp", FOLDER / "flight.webp")
+VIEWS, SIZE, NOISE, SEED = 40, 512, 0.03, 3
+# Both fields of the comparison are trained until they have colours and detail.
+OPTIONS = {"preset": "fast", "max_image_size": SIZE, "orbit_frames": 48, "trial_steps": 2000}
+SIDE, GAP, CAPTION, CROP = 340, 8, 26, 120  # px; the crop is of the render
+FLIGHT_SIDE, FLIGHT_MS = 420, 70
 
 
 def main() -> None:
     """Make a scene, refine it, draw both pictures."""
-    matplotlib.use("Agg")
     with tempfile.TemporaryDirectory() as temporary:
         scene, out = Path(temporary, "scene"), Path(temporary, "out")
-        make_scene(scene, "dome", own=None, views=VIEWS, size=SIZE, noise=NOISE, seed=SEED)
-        result = biresnerf.refine(
-            scene, out, progress=True, preset="fast", max_image_size=SIZE, orbit_frames=0
-        )
-        draw_cameras(result, CAMERAS)
+        make_scene(scene, "still-life", own=None, views=VIEWS, size=SIZE, noise=NOISE, seed=SEED)
+        result = biresnerf.refine(scene, out, progress=True, **OPTIONS)
         draw_before_after(result, BEFORE_AFTER)
-
-
-def draw_cameras(result: Result, path: Path) -> None:
-    """The cameras on their way from the given poses to the refined ones, as an animation."""
-    way = np.linspace(0, 1, MOVING)
-    eased = np.concatenate([np.zeros(STILL), way**2 * (3 - 2 * way), np.ones(2 * STILL)])
-    frames = [_drawn(replace(result, poses=between(result, share))) for share in eased]
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=FRAME_MS, loop=0, quality=70)
-
-
-def between(result: Result, share: float) -> Array:
-    """Poses [n, 4, 4] on the shortest way from the given to the returned ones."""
-    start, end = result.poses_before, result.poses
-    turn = Rotation.from_matrix(end[:, :3, :3] @ start[:, :3, :3].swapaxes(1, 2)).as_rotvec()
-    poses = start + share * (end - start)
-    poses[:, :3, :3] = Rotation.from_rotvec(share * turn).as_matrix() @ start[:, :3, :3]
-    return poses
-
-
-def _drawn(result: Result) -> Image.Image:
-    figure = plt.figure(figsize=(5, 4), dpi=100)
-    axes = figure.add_axes((-0.1, -0.15, 1.2, 1.3), projection="3d")
-    result.plot_cameras(axes)
-    axes.set_axis_off()
-    axes.get_legend().remove()
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    plt.close(figure)
-    return Image.open(buffer).convert("RGB")
+        draw_flight(result, FLIGHT)
 
 
 def draw_before_after(result: Result, path: Path) -> None:
-    """A photo that no model saw in training, and its renders with the given poses and with the refined ones."""
+    """One unseen view from two fields that were trained equally long, one with either set of poses, and its photo.
+
+    Below, the part in which the renders differ most, enlarged.
+    """
     view = next(one for one in read_view_file(result.folder).views if one.pictures.before)
-    kinds = {
-        "photo": "photo",
-        "before": "short training, given poses",
-        "after": "short training, refined poses",
-        "render": "at the end of the run",
-    }
-    sheet = Image.new("RGB", (len(kinds) * (SIDE + GAP) - GAP, SIDE + CAPTION), "white")
-    draw = ImageDraw.Draw(sheet)
-    for column, (kind, caption) in enumerate(kinds.items()):
-        with Image.open(result.folder / view.pictures.files()[kind]) as picture:
-            large = picture.convert("RGB").resize((SIDE, SIDE), Image.Resampling.LANCZOS)
-        sheet.paste(large, (column * (SIDE + GAP), 0))
-        draw.text((column * (SIDE + GAP) + 4, SIDE + 2), caption, fill="black", font_size=14)
-    sheet.save(path, quality=85)
+    pictures = {}
+    for kind in ("before", "after", "photo"):
+        with Image.open(result.folder / view.pictures.files()[kind]) as opened:
+            pictures[kind] = opened.convert("RGB")
+    turned = float(np.median(rotation_between_deg(result.poses_before, result.poses)))
+    captions = (f"given poses, {turned:.1f}° off", "refined poses", "photo, not used in training")
+    x, y = most_different(*(np.asarray(pictures[kind], np.float64) for kind in ("before", "after")))
+    sheet = Image.new("RGB", (3 * (SIDE + GAP) - GAP, CAPTION + 2 * SIDE + GAP), "white")
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(17)
+    for column, (picture, caption) in enumerate(zip(pictures.values(), captions, strict=True)):
+        left = column * (SIDE + GAP)
+        draw.text((left + 4, CAPTION // 2), caption, "black", font, anchor="lm")
+        scale = SIDE / picture.width
+        sheet.paste(picture.resize((SIDE, SIDE), Image.Resampling.LANCZOS), (left, CAPTION))
+        corner = (left + x * scale, CAPTION + y * scale)
+        draw.rectangle((*corner, *(each + CROP * scale for each in corner)), outline=(31, 119, 180), width=2)
+        crop = picture.crop((x, y, x + CROP, y + CROP)).resize((SIDE, SIDE), Image.Resampling.LANCZOS)
+        sheet.paste(crop, (left, CAPTION + SIDE + GAP))
+    sheet.save(path, quality=82, method=6)
+
+
+def most_different(one: Array, other: Array) -> tuple[int, int]:
+    """The upper left corner of the square of `CROP` px in which two pictures [h, w, 3] differ most."""
+    sums = np.pad(np.abs(one - other).sum(axis=2), ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)
+    within = sums[CROP:, CROP:] - sums[:-CROP, CROP:] - sums[CROP:, :-CROP] + sums[:-CROP, :-CROP]
+    y, x = np.unravel_index(within.argmax(), within.shape)
+    return int(x), int(y)
+
+
+def draw_flight(result: Result, path: Path) -> None:
+    """The run's own video of a flight around the scene, as a picture that pages show."""
+    video = read_view_file(result.folder).orbit
+    assert video is not None
+    with imageio.get_reader(result.folder / video) as reader:
+        frames = [
+            Image.fromarray(frame).resize((FLIGHT_SIDE, FLIGHT_SIDE), Image.Resampling.LANCZOS)
+            for frame in reader
+        ]
+    frames[0].save(
+        path, save_all=True, append_images=frames[1:], duration=FLIGHT_MS, loop=0, quality=55, method=6
+    )
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ from biresnerf.viewer.report_html import REPORT_HTML, read_report, write_report_
 from docs.generate.pictures.screenshots import (
     FOLDER,
     HEIGHT,
+    KIND,
     NAME,
     NOISE,
     SEED,
@@ -47,7 +48,7 @@ def main() -> None:
 def draw_errors(temporary: Path) -> None:
     """Each image's errors before and after; the scene is that of the example."""
     scene, refined = temporary / NAME, temporary / "refined.json"
-    truth = make_scene(scene, "dome", views=VIEWS, size=SIZE, noise=NOISE, seed=SEED).truth
+    truth = make_scene(scene, KIND, views=VIEWS, size=SIZE, noise=NOISE, seed=SEED).truth
     result = biresnerf.load(EXAMPLE)
     # The example keeps poses.json alone of the result's files with poses.
     poses = dict(zip(result.names, result.poses @ OPENGL_FROM_OPENCV, strict=True))

@@ -26,7 +26,7 @@ FOLDER = ROOT / "docs/pictures"
 SCREENSHOTS = {
     name: FOLDER / f"page_{name}.webp" for name in ("check", "running", "list", "result", "compare")
 }
-NAME, VIEWS, SIZE, NOISE, SEED = "shapes", 32, 160, 0.12, 3
+NAME, KIND, VIEWS, SIZE, NOISE, SEED = "still-life", "still-life", 32, 160, 0.12, 3
 OTHER = {"preset": "fast", "steps": 500}  # of the job that the first is compared with
 PERCENT = "Number(document.querySelector('[role=progressbar]')?.getAttribute('aria-valuenow'))"
 RUNNING_PERCENT = 50  # of the run, where its picture is taken
@@ -47,7 +47,7 @@ def main() -> None:
     ):
         scene = Path(temporary, NAME)
         browser = chromium_of(playwright)
-        make_scene(scene, "dome", views=VIEWS, size=SIZE, noise=NOISE, seed=SEED)
+        make_scene(scene, KIND, views=VIEWS, size=SIZE, noise=NOISE, seed=SEED)
         page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}, color_scheme="light")
         page.set_default_timeout(PATIENCE_MS)
         page.goto(url)
@@ -118,7 +118,7 @@ def _check_predictions(client: Client, job_id: str, left: float | None, at: date
 
 def _show_result(page: Page) -> None:
     page.get_by_role("heading", name="Downloads").wait_for()
-    page.get_by_role("slider", name="Swipe between before and after").wait_for()
+    page.get_by_role("slider", name="Swipe between photo and render").wait_for()
     page.wait_for_function("() => document.querySelector('.compare-frame img')?.naturalWidth > 0")
     _wait_for_drawing(page)
     _take(page, "result")

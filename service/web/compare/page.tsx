@@ -118,7 +118,7 @@ function PoseTable({ compared: { poses, photos } }: { compared: Comparison }) {
     <>
       <p>
         {count(photos, "photo")} in both: poses differ by {short(median(turned), 2)}° (median), {short(turned[0] ?? null, 2)}° at most. The second
-        result was moved onto the first.
+        result was aligned with the first, so a turn that all cameras share is not counted.
       </p>
       <ScrolledTable label="Differences of poses">
         <thead>

@@ -92,7 +92,14 @@ function RunAgain({ job }: { job: JobView }) {
     >
       {(problem) => (
         <>
-          <OptionsForm values={values} onChange={setValues} base={job.resolved_options ?? job.options} problems={problem?.errors ?? []} />
+          <OptionsForm
+            values={values}
+            onChange={setValues}
+            preset={presetOf(job)}
+            base={job.resolved_options ?? job.options}
+            problems={problem?.errors ?? []}
+            withPresets
+          />
           <p class="soft">
             A fork reuses COLMAP's result or all of stage 1, as far as the changed options allow; if they allow neither, the
             service says why.
@@ -101,4 +108,10 @@ function RunAgain({ job }: { job: JobView }) {
       )}
     </DialogButton>
   );
+}
+
+/** Null where the job names none and no worker has chosen one yet. */
+function presetOf(job: JobView): string | null {
+  const { preset } = job.resolved_options ?? job.options;
+  return typeof preset === "string" ? preset : null;
 }

@@ -7,6 +7,11 @@ import { ProblemBox } from "../parts/problem_box";
 import { useTitle } from "../parts/title";
 
 const fileOf = (name: string) => `example/${name}`;
+/** A job of yours has these and more, among them a COLMAP model and a report to open offline. */
+const DOWNLOADS = [
+  ["transforms.json", "the set's own file with the refined poses, for nerfstudio and instant-ngp"],
+  ["poses.json", "poses before and after, with the accuracy of each"],
+] as const;
 const urlOf = (name: string) => address(fileOf(name));
 
 export function ExamplePage() {
@@ -20,11 +25,24 @@ export function ExamplePage() {
       <header class="job-header">
         <h1>A finished example</h1>
         <p class="soft">
-          {result.report.images.length} photos of a made scene, each with a pose turned at random, and what came of them. To refine a
+          {result.report.images.length} photos of a made scene, whose poses were turned at random, and the result. To refine a
           set yourself, choose <em>Try a sample set</em> on the <a href="#/">start page</a>.
         </p>
       </header>
       <widgets.ResultView {...result} urlOf={urlOf} />
+      <section class="panel" aria-labelledby="downloads-heading">
+        <h2 id="downloads-heading">Downloads</h2>
+        <ul>
+          {DOWNLOADS.map(([name, words]) => (
+            <li key={name}>
+              <a href={urlOf(name)} download={name}>
+                {name}
+              </a>
+              : {words}
+            </li>
+          ))}
+        </ul>
+      </section>
     </article>
   );
 }

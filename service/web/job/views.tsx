@@ -8,10 +8,11 @@ import { shared } from "../api/http";
 import { useStore } from "../api/store";
 import { isOver } from "../jobs/state";
 import { ProblemBox } from "../parts/problem_box";
-import { useSetPhotos } from "../upload/set_photos";
+import { type SetPhotos, useSet, useSetPhotos } from "../upload/set_photos";
 import { Images, photoActions } from "./images";
 import type { LiveState } from "./live_job";
 import { Seeding } from "./seeding";
+import { WaitingCameras, WaitingPhotos } from "./waiting";
 
 export function JobViews({ seen, urlOf }: { seen: LiveState; urlOf: UrlOf }) {
   const { poses, report, view, points, history } = seen;
@@ -25,6 +26,7 @@ export function JobViews({ seen, urlOf }: { seen: LiveState; urlOf: UrlOf }) {
   const { names, cameras, centres, rows, cellOf: ownCellOf, photoOf } = useWidgetData(poses, report, view, urlOf);
   const setCellOf = useSetPhotos(guest || !poses || view?.contact_sheet ? null : job.dataset_id, names);
   const cellOf = view?.contact_sheet ? ownCellOf : setCellOf;
+  const waiting = useSet(guest || over || poses ? null : job.dataset_id);
   if (problem) return <ProblemBox problem={problem} />;
   if (over && !poses && !history.length) return null;
   const scene = (
@@ -32,16 +34,16 @@ export function JobViews({ seen, urlOf }: { seen: LiveState; urlOf: UrlOf }) {
       {widgets && poses ? (
         <widgets.SceneView {...{ cameras, points, cellOf, photoOf, ...choice }} />
       ) : (
-        <Placeholder job={job} for="cameras" />
+        <WaitingCameras photos={waiting} words={placeholderWords(job, "cameras")} />
       )}
     </Panel>
   );
   const pictures = (
-    <Panel key="pictures" name={view ? "Before and after" : job.stage === "seeding" ? "Feature matches" : "Preview"} kind="panel-compare">
+    <Panel key="pictures" name={view ? "Result" : job.stage === "seeding" ? "Feature matches" : "Preview"} kind="panel-compare">
       {widgets && view ? (
         <widgets.ImageCompare {...{ names, centres, urlOf, ...choice }} views={view.views} />
       ) : (
-        <Preview seen={seen} poses={poses} urlOf={urlOf} />
+        <Preview seen={seen} poses={poses} urlOf={urlOf} waiting={waiting} />
       )}
     </Panel>
   );
@@ -110,20 +112,22 @@ function Panel({ name, kind, children }: { name: string; kind: string; children:
 
 /** Stands in for what is not there yet. */
 function Placeholder({ job, for: what }: { job: JobView; for: string }) {
-  const words = isOver(job)
-    ? `This job has no ${what}.`
-    : job.state === "queued"
-      ? `The ${what} appear soon after the job starts.`
-      : `The ${what} appear once the optimisation starts.`;
-  return <p class="waiting soft">{words}</p>;
+  return <p class="waiting soft">{placeholderWords(job, what)}</p>;
+}
+
+function placeholderWords(job: JobView, what: string): string {
+  if (isOver(job)) return `This job has no ${what}.`;
+  return job.state === "queued" ? `The ${what} appear soon after the job starts.` : `The ${what} appear once the optimisation starts.`;
 }
 
 const KINDS = ["render", "photo", "difference", "depth"] as const;
 
 /** One view as the field renders it now. */
-function Preview({ seen, poses, urlOf }: { seen: LiveState; poses: PosesDocument | null; urlOf: UrlOf }) {
+function Preview(props: { seen: LiveState; poses: PosesDocument | null; urlOf: UrlOf; waiting: SetPhotos | null }) {
+  const { seen, poses, urlOf, waiting } = props;
   const pictures = previewPictures(seen.artifacts);
   if (!pictures.size && seen.seeding && !isOver(seen.job!)) return <Seeding seeding={seen.seeding} urlOf={urlOf} />;
+  if (!pictures.size && waiting) return <WaitingPhotos job={seen.job!} photos={waiting} />;
   if (!pictures.size) return <Placeholder job={seen.job!} for="pictures" />;
   const lens = poses?.cameras[0];
   const frame = lens && { aspectRatio: `${lens.width} / ${lens.height}` };

@@ -15,7 +15,7 @@ export function Outcome() {
   if (!pictures) return null;
   return (
     <section class="card outcome" aria-labelledby="outcome-heading">
-      <h2 id="outcome-heading">What comes of it</h2>
+      <h2 id="outcome-heading">Example result</h2>
       <p class="soft">
         A view that no training saw, rendered with the poses of the input and with the refined ones.{" "}
         <a href="#/example">See the whole result</a>

@@ -6,7 +6,7 @@ import { worded } from "../../../biresnerf/viewer/widgets/option_words";
 import { once, useLoaded } from "../api/hooks";
 import { requestJson } from "../api/http";
 import { ProblemBox } from "../parts/problem_box";
-import { type Field, fieldsOf, helpOf, parsed, presetValue, type Values, words } from "./schema";
+import { type Field, fieldsOf, fieldWords, helpOf, parsed, presetValue, type Values, words } from "./schema";
 
 const PRESET_WORDS: Record<string, string> = {
   fast: "A first result within minutes",
@@ -15,14 +15,24 @@ const PRESET_WORDS: Record<string, string> = {
   paper: "The published configuration",
 };
 
+interface PresetProps {
+  /** The one that applies; null where a worker has yet to choose it. */
+  preset: string | null;
+  onChange: (preset: string) => void;
+  /** Seconds that a job with each preset would take, as far as known. */
+  expected?: CheckReport["expected_s"];
+}
+
 interface Props {
   values: Values;
   onChange: (change: (values: Values) => Values) => void;
+  /** The preset where the values name none: that of the check, or of the job. */
+  preset: string | null;
   /** Values of the fields that are left empty; without it, those of the preset. */
   base?: Values;
-  /** Seconds that a job with each preset would take, as far as known. */
-  expected?: CheckReport["expected_s"];
   problems?: readonly FieldProblem[];
+  /** Shows the presets, too. */
+  withPresets?: boolean;
 }
 
 let loaded: Promise<OptionsView> | null = null;
@@ -36,14 +46,37 @@ function loadOptions(): Promise<OptionsView> {
   return loaded;
 }
 
-export function OptionsForm({ values, onChange, base, expected = {}, problems = [] }: Props) {
+/** The presets with their words and times. */
+export function Presets({ preset, onChange, expected = {} }: PresetProps) {
+  const { value: view, problem } = useLoaded(loadOptions, once, []);
+  if (problem) return <ProblemBox problem={problem} />;
+  if (!view) return <p class="soft">Loading the presets …</p>;
+  return (
+    <fieldset class="presets">
+      <legend>Preset</legend>
+      {Object.keys(view.presets).map((name) => {
+        const seconds = expected[name as keyof typeof expected];
+        return (
+          <label key={name} class={name === preset ? "preset chosen" : "preset"}>
+            <input type="radio" name="preset" checked={name === preset} onChange={() => onChange(name)} />
+            <strong>{name[0]!.toUpperCase() + name.slice(1)}</strong>
+            <span>{PRESET_WORDS[name]}</span>
+            {seconds !== undefined && <span class="preset-time">about {roughlyBetween(...seconds)}</span>}
+          </label>
+        );
+      })}
+    </fieldset>
+  );
+}
+
+export function OptionsForm({ values, onChange, preset: usual, base, problems = [], withPresets = false }: Props) {
   const { value: view, problem } = useLoaded(loadOptions, once, []);
   const fields = useMemo(() => view && fieldsOf(view.json_schema), [view]);
   if (problem) return <ProblemBox problem={problem} />;
   if (!view || !fields) return <p class="soft">Loading the options …</p>;
-  const preset = String(values.preset ?? base?.preset ?? "fast");
-  const fallback = (name: string) =>
-    base && !values.preset && name in base ? words(base[name]) : presetValue(view, preset, name);
+  const preset = values.preset === undefined ? usual : String(values.preset);
+  const fallback = (field: Field) =>
+    base && !values.preset && field.name in base ? fieldWords(field, base[field.name]) : presetValue(view, preset, field);
   const set = (name: string, value: unknown) => {
     onChange(({ [name]: _, ...others }) => (value === undefined ? others : { ...others, [name]: value }));
   };
@@ -52,31 +85,15 @@ export function OptionsForm({ values, onChange, base, expected = {}, problems = 
       key={field.name}
       field={field}
       value={values[field.name]}
-      fallback={fallback(field.name)}
+      fallback={fallback(field)}
       problem={problems.find(({ pointer }) => pointer.split("/").includes(field.name))?.detail}
       onChange={(value) => set(field.name, value)}
     />
   );
-  const changed = [...fields.usual, ...fields.expert].filter(({ name }) => name in values).length;
+  const changed = [...fields.usual, ...fields.expert, ...fields.research].filter(({ name }) => name in values).length;
   return (
     <div class="options">
-      <fieldset class="presets">
-        <legend>Preset</legend>
-        {Object.entries(view.presets).map(([name, filled]) => {
-          const seconds = expected[name as keyof typeof expected];
-          return (
-          <label key={name} class={name === preset ? "preset chosen" : "preset"}>
-            <input type="radio" name="preset" checked={name === preset} onChange={() => set("preset", name)} />
-            <strong>{name[0]!.toUpperCase() + name.slice(1)}</strong>
-            <span>{PRESET_WORDS[name]}</span>
-            {seconds !== undefined && <span class="preset-time">about {roughlyBetween(...seconds)} here</span>}
-            <span class="soft">
-              {filled.steps} steps at {filled.max_image_size} px ({view.presets_on_gpu[name as keyof OptionsView["presets"]]?.max_image_size} px on a GPU)
-            </span>
-          </label>
-          );
-        })}
-      </fieldset>
+      {withPresets && <Presets preset={preset} onChange={(name) => set("preset", name)} />}
       <div class="fields">{fields.main.map(row)}</div>
       <details>
         <summary>
@@ -85,6 +102,8 @@ export function OptionsForm({ values, onChange, base, expected = {}, problems = 
         <div class="fields">{fields.usual.map(row)}</div>
         <h3>Schedule, sizes and output</h3>
         <div class="fields">{fields.expert.map(row)}</div>
+        <h3>For research</h3>
+        <div class="fields">{fields.research.map(row)}</div>
       </details>
     </div>
   );
@@ -108,7 +127,7 @@ function FieldRow(props: RowProps) {
       {grouped ? <span class="field-name">{field.title}</span> : <label for={id}>{field.title}</label>}
       {grouped ? <Several {...props} /> : <Control {...props} id={id} described={described} />}
       <p class="soft" id={`${id}-help`}>
-        {worded(helpOf(field, String(value ?? props.fallback)))}
+        {worded(helpOf(field, String(value ?? props.fallback))).replaceAll("`", "")}
       </p>
       {problem && (
         <p class="bad" id={`${id}-problem`} role="alert">

@@ -19,6 +19,10 @@ interface Schema {
   readonly exclusiveMaximum?: number;
 }
 
+const RATES = /_rate(_final)?$/;
+/** What a help says of the number 0. */
+const ZERO = /[;,.] 0: ([^.;]+)/;
+
 export type Values = Record<string, unknown>;
 
 export interface Field {
@@ -33,12 +37,13 @@ export interface Field {
   most: number | null;
 }
 
-/** The fields by level, without those for research. */
-export function fieldsOf(schema: Schema): { main: Field[]; usual: Field[]; expert: Field[] } {
+/** The fields by level; of those for research, the learning rates. */
+export function fieldsOf(schema: Schema): { main: Field[]; usual: Field[]; expert: Field[]; research: Field[] } {
   const properties = Object.entries(schema.properties ?? {}).filter(([name]) => name !== "preset");
   const fields = (level: string) =>
     properties.filter(([, property]) => property.level === level).map(([name, property]) => fieldOf(name, property));
-  return { main: fields("main"), usual: fields("usual"), expert: fields("expert") };
+  const research = fields("research").filter(({ name }) => RATES.test(name));
+  return { main: fields("main"), usual: fields("usual"), expert: fields("expert"), research };
 }
 
 function fieldOf(name: string, property: Schema): Field {
@@ -61,6 +66,7 @@ function fieldOf(name: string, property: Schema): Field {
 
 /** What a field is for and, where its help says "choice: meaning" of several choices, what the present one means. */
 export function helpOf({ help, choices }: Field, present: string): string {
+  if (ZERO.test(help)) return help.replace(ZERO, "");
   const named = choices.filter((choice) => help.includes(`${choice}: `));
   if (named.length < 2) return help;
   const purpose = help.slice(0, Math.min(...named.map((choice) => help.indexOf(`${choice}: `))));
@@ -69,9 +75,15 @@ export function helpOf({ help, choices }: Field, present: string): string {
 }
 
 /** The value of a field that is left empty. */
-export function presetValue(view: OptionsView, preset: string, name: string): string {
-  const filled: Values = { ...view.presets[preset as keyof OptionsView["presets"]] };
-  return words(filled[name] ?? (view.json_schema as Schema).properties?.[name]?.default);
+export function presetValue(view: OptionsView, preset: string | null, field: Field): string {
+  const filled: Values = preset === null ? {} : { ...view.presets[preset as keyof OptionsView["presets"]] };
+  return fieldWords(field, filled[field.name] ?? (view.json_schema as Schema).properties?.[field.name]?.default);
+}
+
+/** A value in words; a 0 that stands for something else in these words. */
+export function fieldWords({ help }: Field, value: unknown): string {
+  const meant = value === 0 ? ZERO.exec(help)?.[1] : undefined;
+  return meant ?? words(value);
 }
 
 export const words = (value: unknown): string => (value === null || value === undefined ? "decided by the run" : optionText(value));

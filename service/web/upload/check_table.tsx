@@ -44,11 +44,6 @@ export function CheckTable({ dataset }: { dataset: DatasetView }) {
             {count(dataset.files, "file")}, {bytes(dataset.bytes)}
             {dataset.missing.length > 0 && `; ${dataset.missing.length} to come`}
           </Line>
-          {rejected && dataset.error && (
-            <Line mark="bad" name={dataset.error.where || "Image set"}>
-              {dataset.error.detail}
-            </Line>
-          )}
           {report && <Found dataset={dataset} />}
           {!report && !rejected && UNKNOWN.map((name) => (
             <Line key={name} mark="wait" name={name}>

@@ -35,8 +35,11 @@ export function DropZone({ onChosen, compact = false }: Props) {
   return (
     <section class={`drop ${over ? "over" : ""} ${compact ? "compact" : ""}`} aria-label="New image set">
       <div class="drop-words">
-        <p class="drop-lead">Drop photos or a video anywhere on this page</p>
-        <p class="soft">A folder or an archive will do. Poses are optional: known formats are read, and missing poses are found.</p>
+        <p class="drop-lead mouse-only">Drop photos or a video anywhere on this page</p>
+        <p class="drop-lead touch-only">Choose photos or a video</p>
+        <p class="soft">
+          <span class="mouse-only">A folder or an archive will do.</span> Poses are optional: known formats are read, and missing poses are found.
+        </p>
         <details class="drop-formats">
           <summary>Which formats?</summary>
           <p>Poses: {formats.read}.</p>
@@ -44,9 +47,9 @@ export function DropZone({ onChosen, compact = false }: Props) {
         </details>
       </div>
       <div class="drop-buttons">
-        <FileButton label="Choose a folder" folder onFiles={(files) => void take(fromInput(files))} />
+        <FileButton label="Choose a folder" for="mouse" onFiles={(files) => void take(fromInput(files))} />
         <FileButton label="Choose files" onFiles={(files) => void take(fromInput(files))} />
-        <FileButton label="Photo library" photos onFiles={(files) => void take(fromInput(files))} />
+        <FileButton label="Choose photos or a video" for="touch" onFiles={(files) => void take(fromInput(files))} />
         {!compact && !onChosen && (
           <>
             <button type="button" class="act" onClick={() => void take(sample())}>
@@ -95,16 +98,15 @@ function whileDragged(onOver: (over: boolean) => void, onDrop: (data: DataTransf
 
 interface FileButtonProps {
   label: string;
-  folder?: boolean;
-  /** For phones and tablets, which offer their library and camera then. */
-  photos?: boolean;
+  /** touch: for phones and tablets, which offer their library and camera; mouse: for a whole folder. */
+  for?: "touch" | "mouse";
   onFiles: (files: FileList) => void;
 }
 
-function FileButton({ label, folder = false, photos = false, onFiles }: FileButtonProps) {
-  const kind = { webkitdirectory: folder, ...(photos && { accept: "image/*,video/*" }) }; // not in the types of Preact
+function FileButton({ label, for: whom, onFiles }: FileButtonProps) {
+  const kind = { webkitdirectory: whom === "mouse", ...(whom === "touch" && { accept: "image/*,video/*" }) }; // not in the types of Preact
   return (
-    <label class={`act ${folder ? "primary" : ""} ${photos ? "touch-only" : ""}`}>
+    <label class={whom ? `act primary ${whom}-only` : "act"}>
       {label}
       <input
         {...kind}

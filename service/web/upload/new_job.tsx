@@ -1,9 +1,7 @@
 // A checked set before its job: what was found, what will happen, photos, given cameras, and the form that submits the job.
 import { useMemo, useState } from "preact/hooks";
 import type { DatasetView, JobView } from "schemas";
-import { bordersOf } from "../../../biresnerf/viewer/result/poses";
-import type { SceneCamera } from "../../../biresnerf/viewer/result/widget_data";
-import { once, useAttempt, useLoaded } from "../api/hooks";
+import { useAttempt } from "../api/hooks";
 import { requestJson } from "../api/http";
 import { nameLabel } from "../jobs/state";
 import { useMasks } from "../masks/use_masks";
@@ -11,11 +9,13 @@ import { OptionsForm } from "../options/form";
 import type { Values } from "../options/schema";
 import { ProblemBox } from "../parts/problem_box";
 import { CheckTable } from "./check_table";
+import { GivenCameras } from "../parts/given_cameras";
 import { Photos } from "./photos";
 import { Plan } from "./plan";
 import { answeredYes, AskedPoses } from "./pose_question";
-import { type SetPhotos, useSet } from "./set_photos";
+import { useSet } from "./set_photos";
 
+const FORM = "new-job";
 /** Options chosen before a set was masked, by the id of the masked one. */
 const carried = new Map<string, Values>();
 
@@ -44,18 +44,32 @@ export function NewJob({ dataset }: { dataset: DatasetView }) {
   };
   return (
     <>
-      <div class="set-views">
-        <CheckTable dataset={dataset} />
-        <Plan report={report} values={values} leftOut={leftOut.size} />
-      </div>
       {question && <AskedPoses question={question} yes={converted} onAnswer={convert} />}
+      <div class="set-views">
+        <Plan report={report} values={values} leftOut={leftOut.size} onPreset={(preset) => setValues((others) => ({ ...others, preset }))}>
+          {problem && <ProblemBox problem={problem} />}
+          <p class="submit">
+            <button class="act primary" form={FORM} disabled={busy || masks.painted.size > 0}>
+              {busy ? "Submitting …" : "Refine the poses"}
+            </button>
+            {masks.painted.size > 0 && <span class="soft">Save the masks first, below.</span>}
+          </p>
+        </Plan>
+        <CheckTable dataset={dataset} />
+      </div>
       {photos && (
         <div class="set-views">
           <Photos {...{ photos, leftOut, masks }} onChange={leaveOut} />
-          {report.with_pose > 0 && <Cameras photos={photos} converted={converted} />}
+          {report.with_pose > 0 && (
+            <section class="card panel-scene" aria-labelledby="given-heading">
+              <h2 id="given-heading">Given cameras</h2>
+              <GivenCameras photos={photos} converted={converted} />
+            </section>
+          )}
         </div>
       )}
       <form
+        id={FORM}
         class="card"
         aria-label="Options"
         onSubmit={(event) => {
@@ -64,44 +78,8 @@ export function NewJob({ dataset }: { dataset: DatasetView }) {
         }}
       >
         <h2>Options</h2>
-        <OptionsForm values={values} onChange={setValues} expected={report.expected_s} problems={problem?.errors ?? []} />
-        {problem && <ProblemBox problem={problem} />}
-        <p class="submit">
-          <button class="act primary" disabled={busy || masks.painted.size > 0}>
-            {busy ? "Submitting …" : "Refine the poses"}
-          </button>
-          {masks.painted.size > 0 && <span class="soft">Save the masks first, above.</span>}
-        </p>
+        <OptionsForm values={values} onChange={setValues} preset={report.preset} problems={problem?.errors ?? []} />
       </form>
     </>
-  );
-}
-
-/** The given cameras in three dimensions; the code for it is loaded for sets that have poses. */
-function Cameras({ photos: { list, cellOf }, converted }: { photos: SetPhotos; converted: boolean }) {
-  const { value: widgets } = useLoaded(() => import("../job/widgets"), once, []);
-  const [selected, setSelected] = useState<number | null>(null);
-  const posed = useMemo(() => list.photos.flatMap(({ world_from_cam }, index) => (world_from_cam ? [index] : [])), [list]);
-  const cameras = useMemo<SceneCamera[]>(() => {
-    const borders = list.cameras.map(bordersOf);
-    return posed.map((index) => {
-      const { name, camera, world_from_cam, read_as_asked } = list.photos[index]!;
-      const pose = (converted && read_as_asked) || world_from_cam!;
-      return {
-        ...{ name, before: null, after: pose, returned: pose, source: "given", borders: borders[camera]! },
-        ...{ moved_deg: 0, moved_units: 0, delta_psnr: null, flags: [], uncertainty: null },
-      };
-    });
-  }, [list, posed, converted]);
-  const cellOfPosed = useMemo(() => (camera: number) => cellOf(posed[camera]!), [cellOf, posed]);
-  return (
-    <section class="card panel-scene" aria-labelledby="given-heading">
-      <h2 id="given-heading">Given cameras</h2>
-      {widgets ? (
-        <widgets.SceneView cameras={cameras} cellOf={cellOfPosed} selected={selected} onSelect={setSelected} />
-      ) : (
-        <p class="waiting soft">Loading …</p>
-      )}
-    </section>
   );
 }

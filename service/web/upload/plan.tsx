@@ -1,20 +1,27 @@
-// What a job would do with a checked set, in words.
+// What a job would do with a checked set, in words; how long it takes with each preset, and the button that starts it.
+import type { ComponentChildren } from "preact";
 import type { CheckReport } from "schemas";
-import { count, roughlyBetween } from "../../../biresnerf/viewer/widgets/numbers";
+import { count } from "../../../biresnerf/viewer/widgets/numbers";
+import { Presets } from "../options/form";
 import type { Values } from "../options/schema";
 
 interface Props {
   report: CheckReport;
   values: Values;
   leftOut: number;
+  onPreset: (preset: string) => void;
+  /** What submits the job. */
+  children: ComponentChildren;
 }
 
-export function Plan({ report, values, leftOut }: Props) {
-  const seconds = report.expected_s[String(values.preset ?? report.preset) as keyof CheckReport["expected_s"]];
+export function Plan({ report, values, leftOut, onPreset, children }: Props) {
   const altered = ["steps", "time_budget_s", "max_image_size", "samples_per_step"].some((name) => name in values);
   return (
     <section class="card plan" aria-labelledby="plan-heading">
       <h2 id="plan-heading">What will happen</h2>
+      <Presets preset={String(values.preset ?? report.preset)} onChange={onPreset} expected={altered ? {} : report.expected_s} />
+      {!altered && <p class="soft">Times are for this machine, after the job starts and if nothing else keeps it busy.</p>}
+      {children}
       <ol>
         {leftOut > 0 && <li>{count(leftOut, "photo")} of {report.images} {leftOut === 1 ? "is" : "are"} left out.</li>}
         <li>{startWords(report, String(values.start ?? "auto"))}</li>
@@ -27,11 +34,6 @@ export function Plan({ report, values, leftOut }: Props) {
               : "A test on photos that were held back shows whether the refined poses are better than those found first."}
         </li>
       </ol>
-      {seconds !== undefined && !altered && (
-        <p>
-          It takes <strong>about {roughlyBetween(...seconds)}</strong> on this machine after it starts, if nothing else keeps the machine busy.
-        </p>
-      )}
     </section>
   );
 }

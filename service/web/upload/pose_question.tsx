@@ -24,7 +24,7 @@ export function AskedPoses({ question, yes, onAnswer }: Props) {
           Convert
         </button>
         <span class="soft" role="status">
-          {yes ? "The job reads them so; the given cameras below are shown so." : "They are used as they are."}
+          {yes ? "The job converts them; the cameras below are shown converted." : "They are used unchanged."}
         </span>
       </p>
     </section>
