@@ -96,6 +96,7 @@ notebooks: setup  ## run the notebooks of examples/ and keep their outputs; NOTE
 screenshots: web  ## the pictures of the page that the docs show, and its finished example (minutes; Chromium)
 	$(BIN)/python -m docs.generate.pictures.screenshots
 	$(BIN)/python -m docs.generate.pictures.result_pictures
+	$(BIN)/python -m docs.generate.pictures.moving_cameras
 
 fuzz: setup  ## a hundred thousand made-up requests against a real service; FUZZ="arguments"
 	$(BIN)/python -m tests.service.fuzzing $(FUZZ)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from docs.generate.pages import GENERATED, ROOT
-from docs.generate.pictures import refined_scene, result_pictures, screenshots
+from docs.generate.pictures import moving_cameras, refined_scene, result_pictures, screenshots
 from tests.docs.documented import PAGES
 
 FOLDER = ROOT / "docs/pictures"
@@ -22,7 +22,8 @@ def shown_pictures():
 
 def test_a_command_makes_each_picture_and_a_page_shows_it():
     drawn = {path for path in GENERATED if path.parent == FOLDER}
-    made = drawn | {*refined_scene.PICTURES, *result_pictures.PICTURES, *screenshots.SCREENSHOTS.values()}
+    made = drawn | {refined_scene.BEFORE_AFTER, *result_pictures.PICTURES, *screenshots.SCREENSHOTS.values()}
+    made.add(moving_cameras.CAMERAS)
     assert {path for path in FOLDER.iterdir() if path.is_file()} == made
     assert made == {path for _, path in shown_pictures() if path.parent == FOLDER}
 

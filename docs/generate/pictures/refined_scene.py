@@ -1,6 +1,6 @@
-"""The other pictures of the README: `python -m docs.generate.pictures.refined_scene` refines a made still life.
+"""The README's first picture: `python -m docs.generate.pictures.refined_scene` refines a made still life.
 
-Takes about ten minutes. Writes docs/pictures/before_after.webp and flight.webp.
+Takes about ten minutes. Writes docs/pictures/before_after.webp.
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-import imageio.v2 as imageio
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
@@ -19,23 +18,20 @@ from biresnerf.data.show.view_file import read_view_file
 from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.result import Result
 
-FOLDER = Path(__file__).resolve().parents[2] / "pictures"
-BEFORE_AFTER, FLIGHT = PICTURES = (FOLDER / "before_after.webp", FOLDER / "flight.webp")
+BEFORE_AFTER = Path(__file__).resolve().parents[2] / "pictures/before_after.webp"
 VIEWS, SIZE, NOISE, SEED = 40, 512, 0.03, 3
 # Both fields of the comparison are trained until they have colours and detail.
-OPTIONS = {"preset": "fast", "max_image_size": SIZE, "orbit_frames": 48, "trial_steps": 2000}
+OPTIONS = {"max_image_size": SIZE, "steps": 1000, "trial_steps": 800, "orbit_frames": 0, "shown_views": 0}
 SIDE, GAP, CAPTION, CROP = 340, 8, 26, 120  # px; the crop is of the render
-FLIGHT_SIDE, FLIGHT_MS = 420, 70
 
 
 def main() -> None:
-    """Make a scene, refine it, draw both pictures."""
+    """Make a scene, refine it, draw the picture."""
     with tempfile.TemporaryDirectory() as temporary:
         scene, out = Path(temporary, "scene"), Path(temporary, "out")
         make_scene(scene, "still-life", own=None, views=VIEWS, size=SIZE, noise=NOISE, seed=SEED)
-        result = biresnerf.refine(scene, out, progress=True, **OPTIONS)
+        result = biresnerf.refine(scene, out, progress=True, preset="fast", **OPTIONS)
         draw_before_after(result, BEFORE_AFTER)
-        draw_flight(result, FLIGHT)
 
 
 def draw_before_after(result: Result, path: Path) -> None:
@@ -71,20 +67,6 @@ def most_different(one: Array, other: Array) -> tuple[int, int]:
     within = sums[CROP:, CROP:] - sums[:-CROP, CROP:] - sums[CROP:, :-CROP] + sums[:-CROP, :-CROP]
     y, x = np.unravel_index(within.argmax(), within.shape)
     return int(x), int(y)
-
-
-def draw_flight(result: Result, path: Path) -> None:
-    """The run's own video of a flight around the scene, as a picture that pages show."""
-    video = read_view_file(result.folder).orbit
-    assert video is not None
-    with imageio.get_reader(result.folder / video) as reader:
-        frames = [
-            Image.fromarray(frame).resize((FLIGHT_SIDE, FLIGHT_SIDE), Image.Resampling.LANCZOS)
-            for frame in reader
-        ]
-    frames[0].save(
-        path, save_all=True, append_images=frames[1:], duration=FLIGHT_MS, loop=0, quality=55, method=6
-    )
 
 
 if __name__ == "__main__":

@@ -79,6 +79,7 @@ def chromium_of(playwright: Playwright) -> Browser:
 def _show_check(page: Page) -> None:
     page.get_by_role("button", name="Refine the poses").wait_for()
     page.get_by_text("A first result within minutes").click()
+    page.get_by_role("application").wait_for()
     _wait_for_drawing(page)
     _take(page, "check")
 

@@ -1,4 +1,4 @@
-// What comes of a job, for those who have none yet: one view of the finished example.
+// An example result, for those who have no job yet: one view of the finished example.
 import type { ViewFile } from "schemas";
 import { address, requestJson } from "../api/http";
 import { once, useLoaded } from "../api/hooks";
