@@ -211,7 +211,7 @@ def test_cameras_are_adjusted_to_as_many_tracks_as_the_method_says(tiny):
     scene = replace(given_scene(*tiny), tracks=true_matches(tiny[0]))
     amounts = []
     for most in (200, 10**6):
-        run = optimiser(tiny, {"evidence.most_observations": most})
+        run = optimiser(tiny, {"evidence.most_observations": most, "evidence.of_camera": (0, 0)})
         placed = torch.ones(7, dtype=torch.bool).numpy()
         fitted = without_patches(scene, run.joint, "auto", placed, run.method.evidence).fitted
         assert fitted.numbers is run.method.evidence
