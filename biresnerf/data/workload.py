@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.panoramas.cut_panoramas import as_views
 from biresnerf.data.scene_kind import SceneKind
+from biresnerf.data.seeding.colmap_tracks import MOST_OBSERVATIONS, OF_IMAGE
 from biresnerf.data.seeding.map_images import (
     ALL_PAIRS_UP_TO,
     BY_LIKENESS,
@@ -25,8 +26,8 @@ from biresnerf.options.refine_options import ResolvedOptions, SeedingEffort
 # Shares of all steps: where cameras are adjusted first, and how long the field then learns at their poses. The first is
 # soon enough: on the demo scene cameras adjusted after half of the steps end as exact as after all (docs/estimator.md).
 FIRST_ROUND, LEARNING = 0.5, 0.25
-# Cameras. Their system is dense: 1,000 take five minutes of one core and 1.9 GB.
-LEAST_ADJUSTED, MOST_ADJUSTED = 3, 1000
+# Cameras: of 3,000 a candidate takes minutes, where they see what is near them (docs/estimator.md).
+LEAST_ADJUSTED, MOST_ADJUSTED = 3, 3000
 # Shares of a training after which fields are compared. What differs clearly differs more and more (docs/verdict.md).
 LOOKS = (0.25, 0.5, 1.0)
 TRIAL_STEPS = 200  # of those that choose the start
@@ -41,6 +42,9 @@ PHOTO_TRIALS = 2
 # their choice, which are bounded. lego at 100 px, fountain-P11, temple and fox (4, 35, 58 and 87 thousand) take 7.0,
 # 6.9, 10.6 to 16.6, and 11.0 to 12.1 s.
 ADJUSTMENT = 140.0
+# The same of each of 1,000 cameras, and more of each of more, as the fronts of a flight grow: three adjustments and
+# five covariances, of 20 and 2 s (`benchmarks.method.many_cameras`), less what their observations take.
+EACH_ADJUSTED = 0.8
 OBSERVED = 0.5  # of a photo's features, of tracks: 0.4 to 0.8 in these sets
 # Trial steps that take as long as the rest of a verdict: fox's took 3.5 s without its training, 2.2 of them renders
 # that take a third of it at coarser intervals.
@@ -89,13 +93,19 @@ def workload(dataset: Dataset, options: ResolvedOptions, *, kind: SceneKind, adj
         features, pairs, search = _search(dataset, options.seeding_effort)
         amounts["features"] = search
         amounts |= matching_work([features] * len(dataset), pairs)
-        observations = OBSERVED * features * len(dataset)
+        most = max(MOST_OBSERVATIONS, OF_IMAGE * len(dataset))
+        observations = min(OBSERVED * features * len(dataset), most)
     if matched and options.start == "auto" and dataset.posed.any():
         amounts["trying"] = LOOKS[0] * _trial(TRIAL_STEPS, kind=kind)
     # Mostly, matches start the run and move cameras little after it: photos need not judge that.
-    adjusting = 2 * (ADJUSTMENT + observations / 1000) if adjusts else 0.0
+    adjusting = 2 * adjustment_work(len(dataset), observations) if adjusts else 0.0
     amounts |= after_steps(options, kind, adjusting=adjusting, checks=False)
     return Workload(amounts, weights, share)
+
+
+def adjustment_work(cameras: int, observations: float) -> float:
+    """Work of one adjustment of all cameras."""
+    return ADJUSTMENT + observations / 1000 + EACH_ADJUSTED * cameras * (cameras / 1000) ** 0.5
 
 
 def can_be_adjusted(count: int) -> bool:

@@ -210,13 +210,14 @@ def test_the_verdict_takes_for_unchanged_what_the_method_cannot_measure(tiny, tm
 def test_cameras_are_adjusted_to_as_many_tracks_as_the_method_says(tiny):
     scene = replace(given_scene(*tiny), tracks=true_matches(tiny[0]))
     amounts = []
-    for most in (200, 10**6):
-        run = optimiser(tiny, {"evidence.most_observations": most, "evidence.of_camera": (0, 0)})
+    for most, cameras in ((200, 7), (200, 4), (10**6, 7)):
+        changed = {"evidence.most_observations": most, "evidence.up_to_cameras": cameras}
+        run = optimiser(tiny, changed)
         placed = torch.ones(7, dtype=torch.bool).numpy()
         fitted = without_patches(scene, run.joint, "auto", placed, run.method.evidence).fitted
         assert fitted.numbers is run.method.evidence
         amounts.append(len(fitted.tracks.point))
-    assert amounts[0] <= 200 < amounts[1]
+    assert amounts[0] <= 200 < amounts[1] <= 350 < amounts[2]
 
 
 def test_photos_are_asked_about_motions_that_the_method_takes_for_seen(tiny, tmp_path):

@@ -90,9 +90,9 @@ def without_patches(
     if tracks is not None:
         tracks = straight_tracks(tracks, intrinsics, ideal)
         fitted, judging = tracks.split()
-        candidates, end = (of_camera * len(dataset) for of_camera in numbers.of_camera)
-        tracks = tracks.thinned(max(numbers.most_in_the_end, end), len(dataset))
-        fitted = fitted and fitted.thinned(max(numbers.most_observations, candidates), len(dataset))
+        more = max(1.0, len(dataset) / numbers.up_to_cameras)
+        tracks = tracks.thinned(round(more * numbers.most_in_the_end), len(dataset))
+        fitted = fitted and fitted.thinned(round(more * numbers.most_observations), len(dataset))
     measured = measured_evidence(dataset, joint.unit_from_cam, placed, numbers)
     return SplitEvidence(
         replace(measured, tracks=fitted, lenses=before if before.free.any() else None),

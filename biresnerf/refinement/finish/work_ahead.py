@@ -11,9 +11,9 @@ from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.images import load_images
 from biresnerf.data.photos.panoramas.cut_panoramas import as_views
 from biresnerf.data.workload import (
-    ADJUSTMENT,
     FIRST_ROUND,
     LEARNING,
+    adjustment_work,
     after_steps,
     step_weights,
     steps_share,
@@ -100,7 +100,7 @@ def checks_ahead(scene: Scene, optimiser: JointOptimiser, run: RunState) -> bool
 
 def adjustment(scene: Scene) -> float:
     """Work of one adjustment of all cameras."""
-    return ADJUSTMENT + (0.0 if scene.tracks is None else len(scene.tracks.point) / 1000)
+    return adjustment_work(len(scene.dataset), 0 if scene.tracks is None else len(scene.tracks.point))
 
 
 def keep_to_budget(

@@ -14,6 +14,7 @@ from biresnerf.refinement.adjustment.lens.lenses import Lenses
 from biresnerf.refinement.adjustment.solver import covariance as covariances
 from biresnerf.refinement.adjustment.solver import dissection
 from biresnerf.refinement.adjustment.solver.blocks import Blocks
+from biresnerf.refinement.adjustment.solver.body_motions import BodyMoves
 from biresnerf.refinement.adjustment.solver.elimination import inverse_blocks, solution
 from biresnerf.refinement.adjustment.track_term import TrackTerm
 from biresnerf.refinement.finish.expected_errors import expected_errors
@@ -124,6 +125,21 @@ def test_blocks_of_evidence_add_up(fronts):
         expected[6 * camera : 6 * camera + 6, 6 * camera : 6 * camera + 6] += own[0]
     for both in (linear.system + more, more + linear.system):
         np.testing.assert_array_equal(both.dense(), expected)
+
+
+@pytest.mark.parametrize("bodies", BODIES.values(), ids=BODIES.keys())
+def test_a_matrix_of_bodies_is_the_cameras_between_their_columns(bodies):
+    given = rig("corridor", CAMERAS)
+    given = replace(given, evidence=replace(given.evidence, lenses=LENSES["three lenses"]))
+    cameras, linear = linearised(given)
+    moves = BodyMoves.among(cameras, bodies)
+    count = 6 * moves.bodies
+    columns = np.zeros((len(linear.right), count + 24))
+    columns[: 6 * CAMERAS, :count] = moves.of_cameras(np.eye(count).reshape(-1, 6, count)).reshape(-1, count)
+    columns[6 * CAMERAS :, count:] = np.eye(24)
+    expected = columns.T @ linear.system.dense() @ columns
+    size = np.abs(expected).max()
+    np.testing.assert_allclose(moves.reduced(linear.system).dense(), expected, atol=1e-12 * size)
 
 
 @pytest.mark.parametrize("shape", ["ring", "corridor", "aerial"])

@@ -7,7 +7,15 @@ import pytest
 
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.data.scene_kind import SceneKind
-from biresnerf.data.workload import FIRST_ROUND, JUDGING, LEARNING, step_weights, workload
+from biresnerf.data.workload import (
+    ADJUSTMENT,
+    FIRST_ROUND,
+    JUDGING,
+    LEARNING,
+    adjustment_work,
+    step_weights,
+    workload,
+)
 from biresnerf.forecast.run_forecast import Forecast
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.similarity import Similarity
@@ -81,6 +89,13 @@ def test_the_verdict_takes_time_only_where_it_is_asked_for(run_of):
     few, many = (work_ahead(*run_of(trial_steps=steps).parts)["judging"] - JUDGING for steps in (50, 100))
     assert many > 0
     assert many == pytest.approx(2 * few)
+
+
+def test_many_cameras_take_more_than_in_proportion():
+    few, many = (adjustment_work(count, 0) - ADJUSTMENT for count in (1000, 3000))
+    assert few > ADJUSTMENT
+    assert 4 < many / few < 6
+    assert adjustment_work(100, 40_000) < 1.2 * (ADJUSTMENT + 40)
 
 
 def test_methods_of_others_do_not_adjust(run_of):
