@@ -24,7 +24,7 @@ from biresnerf.forecast.run_forecast import Phase
 from biresnerf.options.refine_options import ResolvedOptions, SeedingEffort
 
 # Shares of all steps: where cameras are adjusted first, and how long the field then learns at their poses. The first is
-# soon enough: on the demo scene cameras adjusted after half of the steps end as exact as after all (docs/estimator.md).
+# soon enough: on the dome scene cameras adjusted after half of the steps end as exact as after all (docs/estimator.md).
 FIRST_ROUND, LEARNING = 0.5, 0.25
 # Cameras: of 3,000 a candidate takes minutes, where they see what is near them (docs/estimator.md).
 LEAST_ADJUSTED, MOST_ADJUSTED = 3, 3000

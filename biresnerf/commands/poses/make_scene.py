@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from biresnerf.data.model.dataset import Dataset
 
 KINDS = {
-    "dome": "cameras on a dome above textured shapes; each pose is turned at random",
-    "still-life": "the same cameras above wood, brick, marble and cloth in soft light; the images look like photos",
+    "still-life": "cameras on a dome above wood, brick, marble and cloth in soft light; each pose is turned at random",
+    "dome": "the same cameras above shapes with random textures",
     "phone": "a phone's walk around a table; poses drift, focal length 1 % too long",
     "half": "the same walk as a COLMAP model that lacks half of the images",
     "vase": "a plain vase without background; each pose is turned at random",
@@ -50,7 +50,7 @@ class MadeScene:
 @click.command("make-scene")
 @click.argument("output", type=click.Path(path_type=Path))
 @click.option(
-    "--kind", type=click.Choice(list(KINDS)), default="dome", show_default=True,
+    "--kind", type=click.Choice(list(KINDS)), default="still-life", show_default=True,
     help="; ".join(f"{kind}: {text}" for kind, text in KINDS.items()) + ".",
 )  # fmt: skip
 @click.option(
@@ -90,7 +90,7 @@ def make_scene_command(
 
 def make_scene(
     output: Path,
-    kind: str = "dome",
+    kind: str = "still-life",
     *,
     own: Path | None = None,
     views: int = 60,

@@ -29,10 +29,10 @@ class EvidenceNumbers:
     pixel_shift: float = 0.1  # see above
     scale_deviation: float = 0.03  # of a patch's depth, relative
     # From coarse to fine: blur of the photos (px), and the error at which a comparison has lost three quarters of its
-    # weight. What decides is how soon that falls at the end: on the demo scene 3 left 0.20 degrees, 1.5 left 0.105 and
+    # weight. What decides is how soon that falls at the end: on the dome scene 3 left 0.20 degrees, 1.5 left 0.105 and
     # 0.7 left 0.065.
     patch_levels: tuple[tuple[float, float], ...] = ((1.0, 5.0), (0.5, 1.5), (0.5, 0.7))
-    # Of halves of the patches. On the demo scene they end 0.07 degrees apart where they moved 0.3, and a third of the
+    # Of halves of the patches. On the dome scene they end 0.07 degrees apart where they moved 0.3, and a third of the
     # comparisons fits; on lego at 100 px, where patches do harm, they end 0.34 apart of 0.5, and a fifteenth fits.
     most_apart: float = 0.3
     least_inliers: float = 0.2  # share of the comparisons; see above

@@ -29,7 +29,7 @@ class LostNumbers:
     orbits_deg: tuple[float, ...] = (10, 20, 30, 45, 60)  # about the scene
     rolls_deg: tuple[float, ...] = (-20, 20, -90, 90, 180)  # also photos stored on their side or upside down
     # Errors of an image's own matches beyond so many times the median image's contradict its pose. The largest of any
-    # camera of fountain-P11, lego at 200 px, temple, fox and the demo scene, at true poses and at noise of 0.005 and
+    # camera of fountain-P11, lego at 200 px, temple, fox and the dome scene, at true poses and at noise of 0.005 and
     # 0.15: 3.6.
     times_usual: float = 8.0
     # Times the median image's error: how near to its feature a point must appear to agree with a pose.

@@ -76,7 +76,7 @@ def test_runs_of_any_length_switch_at_the_same_point_of_their_curve(scale):
 
 
 def test_a_rest_before_the_field_forms_is_not_stability():
-    """The error of the demo scene rests for some checks, then falls again."""
+    """The error of the dome scene rests for some checks, then falls again."""
     curve = [12.3, 15.8, 16.2, 16.4, 17.1, 17.5, 17.9, 19.0, 19.8, 20.4, 21.3, 21.7, 22.3, 22.9, 23.1, 23.5]
     assert run(StabilityDetector(0, 10**9), curve)[0] == "running"
 
