@@ -160,8 +160,13 @@ def _judge(f: Findings) -> tuple[VerdictName, str]:
     if f.faults:
         return "inconclusive", " ".join(f.faults)
     if speaks_for:
+        unknown = (
+            "How far they are off is not known: the evidence leaves most of them open."
+            if f.undetermined
+            else ""
+        )
         return "improved", " ".join(
-            filter(None, (f"The refined poses are better by {_named(speaks_for)}.", f.out_of_frame))
+            filter(None, (f"The refined poses are better by {_named(speaks_for)}.", unknown, f.out_of_frame))
         )
     return _without_a_voice(f)
 

@@ -153,7 +153,10 @@ def test_matches_that_leave_most_poses_open_speak_for_none():
         assert decide(replace(matches, determined=share)).verdict == "improved"
         assert decide(replace(blurred, determined=share, moved_px=11.5)).verdict == "improved"
     # Photos that are near their renders need no matches, and found poses yield as before.
-    assert decide(replace(matches, heldout=held_out(4.0))).verdict == "improved"
+    near = replace(matches, heldout=held_out(4.0))
+    assert decide(near).verdict == "improved"
+    assert "is not known" in decide(near).why[0]
+    assert "is not known" not in decide(replace(near, determined=0.5)).why[0]
     assert decide(replace(matches, compared_with="seeded")).returned == "refined"
     assert decide(replace(matches, epipolar=matched(-1.0))).verdict == "kept_input"
 
