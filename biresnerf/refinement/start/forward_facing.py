@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.errors import InputError, Interrupted
+from biresnerf.geometry.rigid import motion_of
+from biresnerf.geometry.similarity import nearest_rotation
 from biresnerf.judging.compare import is_better
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.methods import Recipe
@@ -81,7 +83,7 @@ def mirrored(world_from_cam: NDArray[np.float64]) -> NDArray[np.float64]:
     mirror image. So, in the frame of the mean pose, turns across the viewing direction are reversed, and with them
     the centres' offsets across it.
     """
-    mean = _mean_pose(world_from_cam)
+    mean = motion_of(nearest_rotation(world_from_cam[:, :3, :3].mean(0)), world_from_cam[:, :3, 3].mean(0))
     in_mean = np.linalg.inv(mean) @ world_from_cam
     in_mean[:, :3, :3] = MIRROR @ in_mean[:, :3, :3] @ MIRROR
     in_mean[:, :2, 3] *= -1
@@ -105,11 +107,3 @@ def resemblance_psnr(images: ImageSet, views: list[int]) -> float:
         means = [((photos[others[:count]].mean(0) - photos[view]) ** 2).mean() for count in counts]
         best.append(-10 * np.log10(max(float(min(means)), 1e-12)))
     return float(np.mean(best))
-
-
-def _mean_pose(world_from_cam: NDArray[np.float64]) -> NDArray[np.float64]:
-    left, _, right_t = np.linalg.svd(world_from_cam[:, :3, :3].mean(0))
-    pose = np.eye(4)
-    pose[:3, :3] = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right_t)]) @ right_t
-    pose[:3, 3] = world_from_cam[:, :3, 3].mean(0)
-    return pose
