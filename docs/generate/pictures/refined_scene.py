@@ -20,8 +20,7 @@ from biresnerf.result import Result
 
 BEFORE_AFTER = Path(__file__).resolve().parents[2] / "pictures/before_after.webp"
 VIEWS, SIZE, NOISE, SEED = 40, 512, 0.03, 3
-# Both fields of the comparison are trained until they have colours and detail.
-OPTIONS = {"max_image_size": SIZE, "steps": 1000, "trial_steps": 800, "orbit_frames": 0, "shown_views": 0}
+OPTIONS = {"max_image_size": SIZE, "orbit_frames": 0, "verdict": False}
 SIDE, GAP, CAPTION, CROP = 340, 8, 26, 120  # px; the crop is of the render
 
 
@@ -30,21 +29,42 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         scene, out = Path(temporary, "scene"), Path(temporary, "out")
         make_scene(scene, "still-life", own=None, views=VIEWS, size=SIZE, noise=NOISE, seed=SEED)
-        result = biresnerf.refine(scene, out, progress=True, preset="fast", **OPTIONS)
-        draw_before_after(result, BEFORE_AFTER)
+        result = biresnerf.refine(
+            scene, out, progress=True, preset="fast", max_image_size=SIZE, orbit_frames=0
+        )
+        fields = [
+            biresnerf.refine(
+                poses,
+                Path(temporary, name),
+                progress=True,
+                preset="fast",
+                start="given",
+                fixed=result.names,
+                **OPTIONS,
+            )
+            for poses, name in ((scene, "given"), (out, "refined"))
+        ]
+        turned = float(np.median(rotation_between_deg(result.poses_before, result.poses)))
+        draw_before_after(*fields, turned, BEFORE_AFTER)
 
 
-def draw_before_after(result: Result, path: Path) -> None:
-    """One unseen view from two fields that were trained equally long, one with either set of poses, and its photo.
+def draw_before_after(given: Result, refined: Result, turned: float, path: Path) -> None:
+    """One unseen view of fields that learned equally long from poses that stayed, given and refined, and its photo.
 
     Below, the part in which the renders differ most, enlarged.
     """
-    view = next(one for one in read_view_file(result.folder).views if one.pictures.before)
+    views = {view.image: view for view in read_view_file(refined.folder).views if view.held_out}
+    before = next(view for view in read_view_file(given.folder).views if view.image in views)
+    after = views[before.image]
+    files = (
+        given.folder / before.pictures.render,
+        refined.folder / after.pictures.render,
+        refined.folder / after.pictures.photo,
+    )
     pictures = {}
-    for kind in ("before", "after", "photo"):
-        with Image.open(result.folder / view.pictures.files()[kind]) as opened:
+    for kind, file in zip(("before", "after", "photo"), files, strict=True):
+        with Image.open(file) as opened:
             pictures[kind] = opened.convert("RGB")
-    turned = float(np.median(rotation_between_deg(result.poses_before, result.poses)))
     captions = (f"given poses, {turned:.1f}° off", "refined poses", "photo, not used in training")
     x, y = most_different(*(np.asarray(pictures[kind], np.float64) for kind in ("before", "after")))
     sheet = Image.new("RGB", (3 * (SIDE + GAP) - GAP, CAPTION + 2 * SIDE + GAP), "white")
