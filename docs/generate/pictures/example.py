@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 
 from PIL import Image
@@ -11,12 +12,17 @@ from biresnerf.data.show.history import HISTORY
 from biresnerf.data.show.view_file import ShownView, read_view_file, write_view_file
 
 DOWNLOADS = ("transforms.json",)  # beside poses.json
+UNSEEN, UNSEEN_SIDE = "unseen", 320  # px
 SHOWN, QUALITY = 4, 85  # views, and JPEG quality of their pictures
 
 
 def keep_example(result: Path, example: Path) -> None:
-    """The files of a result that the page shows, with small pictures, in place of what is in ``example``."""
-    shutil.rmtree(example, ignore_errors=True)
+    """The files of a result that the page shows, with small pictures, in place of those in ``example``."""
+    for old in example.glob("*"):
+        if old.is_dir() and old.name != UNSEEN:
+            shutil.rmtree(old)
+        elif old.is_file():
+            old.unlink()
     view = read_view_file(result)
     sheet = [view.contact_sheet.file] if view.contact_sheet else []
     for name in (
@@ -31,6 +37,14 @@ def keep_example(result: Path, example: Path) -> None:
         shutil.copyfile(result / name, example / name)
     views = tuple(_with_small_pictures(one, result, example) for one in view.views[:SHOWN])
     write_view_file(view.model_copy(update={"views": views, "orbit": None}), example)
+
+
+def keep_unseen(pictures: Mapping[str, Image.Image], example: Path) -> None:
+    """Pictures of one unseen view, by what they show, for those who have no job yet."""
+    (example / UNSEEN).mkdir(parents=True, exist_ok=True)
+    for name, picture in pictures.items():
+        small = picture.resize((UNSEEN_SIDE, UNSEEN_SIDE), Image.Resampling.LANCZOS)
+        small.save(example / UNSEEN / f"{name}.jpg", quality=QUALITY, optimize=True)
 
 
 def _with_small_pictures(view: ShownView, result: Path, example: Path) -> ShownView:

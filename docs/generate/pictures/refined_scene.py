@@ -1,10 +1,11 @@
 """The README's first picture: `python -m docs.generate.pictures.refined_scene` refines a made still life.
 
-Takes about ten minutes. Writes docs/pictures/before_after.webp.
+Takes about ten minutes. Writes docs/pictures/before_after.webp, and the same view for the start page.
 """
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 from pathlib import Path
 
@@ -17,6 +18,8 @@ from biresnerf.commands.poses.make_scene import make_scene
 from biresnerf.data.show.view_file import read_view_file
 from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.result import Result
+from docs.generate.pictures.example import keep_unseen
+from service.web_page import EXAMPLE
 
 BEFORE_AFTER = Path(__file__).resolve().parents[2] / "pictures/before_after.webp"
 VIEWS, SIZE, NOISE, SEED = 40, 512, 0.03, 3
@@ -32,6 +35,8 @@ def main() -> None:
         result = biresnerf.refine(
             scene, out, progress=True, preset="fast", max_image_size=SIZE, orbit_frames=0
         )
+        straight = shutil.copytree(scene, Path(temporary, "straight"))
+        shutil.copyfile(out / "transforms.json", straight / "transforms.json")
         fields = [
             biresnerf.refine(
                 poses,
@@ -42,7 +47,7 @@ def main() -> None:
                 fixed=result.names,
                 **OPTIONS,
             )
-            for poses, name in ((scene, "given"), (out, "refined"))
+            for poses, name in ((scene, "given"), (straight, "refined"))
         ]
         turned = float(np.median(rotation_between_deg(result.poses_before, result.poses)))
         draw_before_after(*fields, turned, BEFORE_AFTER)
@@ -62,11 +67,12 @@ def draw_before_after(given: Result, refined: Result, turned: float, path: Path)
         refined.folder / after.pictures.photo,
     )
     pictures = {}
-    for kind, file in zip(("before", "after", "photo"), files, strict=True):
+    for kind, file in zip(("given", "refined", "photo"), files, strict=True):
         with Image.open(file) as opened:
             pictures[kind] = opened.convert("RGB")
+    keep_unseen(pictures, EXAMPLE)
     captions = (f"given poses, {turned:.1f}° off", "refined poses", "photo, not used in training")
-    x, y = most_different(*(np.asarray(pictures[kind], np.float64) for kind in ("before", "after")))
+    x, y = most_different(*(np.asarray(pictures[kind], np.float64) for kind in ("given", "refined")))
     sheet = Image.new("RGB", (3 * (SIDE + GAP) - GAP, CAPTION + 2 * SIDE + GAP), "white")
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(17)
     for column, (picture, caption) in enumerate(zip(pictures.values(), captions, strict=True)):
