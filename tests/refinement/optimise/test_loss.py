@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch.nn.functional import mse_loss, smooth_l1_loss
 
-from biresnerf.refinement.lost import lost_cameras
+from biresnerf.refinement.lost.lost_cameras import LostCameraRepair
 from biresnerf.refinement.optimise.methods import half_squared_error, squared_error
 from tests.refinement.tiny_scene import tiny_optimiser, tiny_options, tiny_set
 
@@ -46,13 +46,12 @@ def test_weighted_cameras_are_compared_by_the_methods_own_loss(scene):
     assert losses[1] == pytest.approx(losses[0], rel=1e-6)
 
 
-def test_repair_moves_cameras_by_the_methods_own_loss(scene, monkeypatch):
-    for share in ("RUN_SHARE", "EVENT_SHARE"):
-        monkeypatch.setattr(lost_cameras, share, 10.0)
+def test_repair_moves_cameras_by_the_methods_own_loss(scene):
     optimiser = tiny_optimiser(*scene, tiny_options())
     for _ in range(20):
         optimiser.step()
-    optimiser.method = replace(optimiser.method, loss=CountedLoss())
+    enough = replace(optimiser.method.lost, run_share=10.0, event_share=10.0)
+    optimiser.method = replace(optimiser.method, loss=CountedLoss(), lost=enough)
     optimiser.camera_errors.doubted[3] = True
-    lost_cameras.LostCameraRepair(optimiser).run()
+    LostCameraRepair(optimiser).run()
     assert optimiser.method.loss.calls >= 40
