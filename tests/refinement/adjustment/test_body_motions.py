@@ -67,6 +67,16 @@ def test_cameras_return_to_the_truth_in_the_frame_that_bodies_leave(rng, bodies)
         np.testing.assert_allclose(*apart, atol=1e-9)
 
 
+def test_where_all_cameras_are_fixed_none_moves_and_none_is_off(rng):
+    truth, evidence = scene(rng, noise_px=0.5)
+    held = RigidBodies(np.arange(CAMERAS), np.ones(CAMERAS, np.bool_))
+    found = adjusted(truth, evidence, held)
+    np.testing.assert_allclose(found, truth, atol=1e-15)
+    errors = expected_errors(found, found, evidence, bodies=held)
+    assert errors.known.all()
+    np.testing.assert_array_equal(errors.covariance, 0)
+
+
 def test_a_camera_that_is_known_exactly_fixes_its_body(rng):
     truth, evidence = scene(rng)
     start = moved_bodies(truth, FIXED_PAIRS, rng)

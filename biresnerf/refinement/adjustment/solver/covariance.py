@@ -53,6 +53,8 @@ def covariance(
         found = _inverses(scaled, seen_aligning(common, counted), free)
     else:
         moves = BodyMoves.among(in_spreads, bodies)
+        if not moves.bodies:  # all cameras are fixed
+            return np.zeros((len(cameras), POSE, POSE))
         seen = seen_aligning(common @ moves.allowed(common), counted)
         held = moves.of_bodies(seen.reshape(len(cameras), POSE, -1)).reshape(POSE * moves.bodies, -1)
         of_body = _inverses(moves.reduced(scaled), held, free)
