@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.panoramas.cut_panoramas import as_views
 from biresnerf.data.scene_kind import SceneKind
-from biresnerf.data.seeding.colmap_tracks import MOST_OBSERVATIONS, OF_IMAGE
+from biresnerf.data.seeding.colmap_tracks import most_observations
 from biresnerf.data.seeding.map_images import (
     ALL_PAIRS_UP_TO,
     BY_LIKENESS,
@@ -93,8 +93,7 @@ def workload(dataset: Dataset, options: ResolvedOptions, *, kind: SceneKind, adj
         features, pairs, search = _search(dataset, options.seeding_effort)
         amounts["features"] = search
         amounts |= matching_work([features] * len(dataset), pairs)
-        most = max(MOST_OBSERVATIONS, OF_IMAGE * len(dataset))
-        observations = min(OBSERVED * features * len(dataset), most)
+        observations = min(OBSERVED * features * len(dataset), most_observations(len(dataset)))
     if matched and options.start == "auto" and dataset.posed.any():
         amounts["trying"] = LOOKS[0] * _trial(TRIAL_STEPS, kind=kind)
     # Mostly, matches start the run and move cameras little after it: photos need not judge that.

@@ -11,7 +11,12 @@ from numpy.typing import NDArray
 from biresnerf.data.points.tracks import KEPT, Tracks
 
 # Handed on: checkpoints carry them, 16 bytes each. Of an image, where that is more.
-MOST_OBSERVATIONS, OF_IMAGE = 200_000, 200
+_MOST_OBSERVATIONS, _OF_IMAGE = 200_000, 200
+
+
+def most_observations(images: int) -> int:
+    """How many observations the tracks of so many images have at most."""
+    return max(_MOST_OBSERVATIONS, _OF_IMAGE * images)
 
 
 def write_tracks(database_path: Path, work: Path) -> Tracks | None:
@@ -33,7 +38,7 @@ def write_tracks(database_path: Path, work: Path) -> Tracks | None:
     tracks = Tracks.of_matches(np.concatenate(images), np.concatenate(xy))
     if tracks is None:
         return None
-    tracks = tracks.thinned(max(MOST_OBSERVATIONS, OF_IMAGE * len(number)), len(number))
+    tracks = tracks.thinned(most_observations(len(number)), len(number))
     arrays: dict[str, Any] = tracks.kept()
     np.savez(work / KEPT, **arrays)
     return tracks
