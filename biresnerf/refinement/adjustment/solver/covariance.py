@@ -43,12 +43,12 @@ def covariance(
     spread = float(np.sqrt(((cameras.centre - cameras.centre.mean(0)) ** 2).sum(1).mean())) or 1.0
     # Positions count in spreads of the rig.
     unit = np.r_[np.ones(3), np.full(3, spread)]
-    none = np.ones(LENS * information.lenses)
-    scaled = information.scaled(np.concatenate([np.tile(unit, len(cameras)), none]))
+    of_lenses = np.ones(LENS * information.lenses)
+    scaled = information.scaled(np.concatenate([np.tile(unit, len(cameras)), of_lenses]))
     counted = np.ones(len(cameras), np.bool_) if aligned is None else aligned
     in_spreads = Cameras(cameras.rotation, cameras.centre / spread)
     common = common_motions(in_spreads, counted)
-    free = (none == 0 if lenses is None else lenses) & (scaled.diagonal[POSE * len(cameras) :] > 0)
+    free = (False if lenses is None else lenses) & (scaled.diagonal[POSE * len(cameras) :] > 0)
     if bodies is None or not bodies.tied:
         found = _inverses(scaled, seen_aligning(common, counted), free)
     else:

@@ -15,9 +15,8 @@ Parts = NDArray[np.int64]
 
 ONE_FRONT = 100  # so few parts are eliminated at once, as a dense matrix
 LEAF = 32  # so few are not parted any more
-TIED_TO_MANY = (
-    0.25  # of all parts: what is tied to more is eliminated last, as a lens that most cameras share
-)
+# Of all parts: what is tied to more is eliminated last, as a lens that most cameras share.
+TIED_TO_MANY = 0.25
 CUTS = np.linspace(0.35, 0.65, 7)  # shares of the parts on one side
 MOST_BETWEEN = 0.4  # of the parts: a larger separator leaves nothing to gain
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -153,14 +152,9 @@ def _entries(matrix: Blocks, front: Front, free: NDArray[np.bool_]) -> Array:
 
 def largest_group(matrix: Blocks) -> NDArray[np.bool_]:
     """Which cameras [n] evidence ties together, directly or through others; of several groups the largest."""
-    told = (matrix.values != 0).any(axis=(1, 2)) & (matrix.other < matrix.cameras)
-    return _largest(matrix.cameras, matrix.rows[told], matrix.other[told])
-
-
-def _largest(
-    count: int, rows: Sequence[int] | NDArray[np.int64], columns: NDArray[np.int64]
-) -> NDArray[np.bool_]:
-    group = np.arange(count)
+    tied = (matrix.values != 0).any(axis=(1, 2)) & (matrix.other < matrix.cameras)
+    rows, columns = matrix.rows[tied], matrix.other[tied]
+    group = np.arange(matrix.cameras)
     while True:
         joined = group.copy()
         np.minimum.at(joined, rows, group[columns])
