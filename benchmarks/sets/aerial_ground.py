@@ -56,20 +56,20 @@ def _is_road(x, y):
 
 @njit(cache=True)
 def _house(x, y, seed):
-    """Height of the roof above a place, its ridge's distance along the slope, and 0 for a house, -1 for none."""
+    """Whether a house stands at a place, the height of its roof, and the distance from its ridge."""
     i, j = int(np.floor(x / PLOT)), int(np.floor(y / PLOT))
     if _hash(i, j, seed + 3) > 0.68:
-        return 0.0, 0.0, -1
+        return False, 0.0, 0.0
     long, wide = 4.5 + 4 * _hash(i, j, seed + 4), 3.5 + 2.5 * _hash(i, j, seed + 5)
     cx, cy = (i + 0.6) * PLOT + 2 * _hash(i, j, seed + 6), (j + 0.6) * PLOT + 2 * _hash(i, j, seed + 7)
     a, b = x - cx, y - cy
     if _hash(i, j, seed + 8) < 0.5:
         a, b = b, a
     if abs(a) > long or abs(b) > wide:
-        return 0.0, 0.0, -1
+        return False, 0.0, 0.0
     walls = 3.0 + 5.0 * _hash(i, j, seed + 9)
     slope = 0.15 + 0.6 * _hash(i, j, seed + 10)
-    return _terrain(cx, cy, seed) + walls + slope * (wide - abs(b)), b, 0
+    return True, _terrain(cx, cy, seed) + walls + slope * (wide - abs(b)), b
 
 
 @njit(cache=True)
@@ -90,9 +90,9 @@ def _tree(x, y, seed):
 
 @njit(cache=True)
 def _height(x, y, seed):
-    roof, _, house = _house(x, y, seed)
+    house, roof, _ = _house(x, y, seed)
     ground = _terrain(x, y, seed)
-    if house == 0:
+    if house:
         return max(roof, ground)
     return ground + _tree(x, y, seed)
 
@@ -224,12 +224,12 @@ def _colour(origin, direction, tops, x0, y0, seed, pixel):
     t = _meet(origin, direction, tops, x0, y0, seed)
     x, y, z = origin[0] + t * direction[0], origin[1] + t * direction[1], origin[2] + t * direction[2]
     finest = 2 * t * pixel
-    _, slope, house = _house(x, y, seed)
-    if house == 0 and z < _height(x, y, seed) - 0.4:
+    house, _, slope = _house(x, y, seed)
+    if house and z < _height(x, y, seed) - 0.4:
         r, g, b = _wall_colour(x, y, z, seed, finest)
         return 0.62 * r, 0.62 * g, 0.62 * b, t
     light = _light(x, y, z, tops, x0, y0, seed)
-    if house == 0:
+    if house:
         r, g, b = _roof_colour(x, y, slope, seed, finest)
     elif _tree(x, y, seed) > 0:
         leaf = _detail(x, y, seed + 60, finest)

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from benchmarks.sets.aerial_ground import render
 from biresnerf.data.model.conventions import file_from_world_from_cam
 from biresnerf.data.synthetic.camera_photos import MAKERS, write_camera_photo
+from biresnerf.geometry.earth.geodesy import held_so
 from biresnerf.geometry.rigid import motion_of
 
 Array = NDArray[np.float64]
@@ -37,10 +38,8 @@ EXPOSED = 1.25
 
 def poses_of(yaw_deg: Array, pitch_deg: Array, centres: Array) -> Array:
     """world_from_cam [n, 4, 4] of level cameras: yaw from north by east, pitch above the horizon; x east, z up."""
-    yaw, pitch = np.radians(yaw_deg), np.radians(pitch_deg)
-    forward = np.stack([np.sin(yaw) * np.cos(pitch), np.cos(yaw) * np.cos(pitch), np.sin(pitch)], 1)
-    right = np.stack([np.cos(yaw), -np.sin(yaw), np.zeros_like(yaw)], 1)
-    return motion_of(np.stack([right, np.cross(forward, right), forward], 2), centres)
+    angles = np.stack([yaw_deg, pitch_deg, np.zeros_like(yaw_deg)], 1)
+    return motion_of(held_so(angles), centres)
 
 
 def flight(count: int, rng: np.random.Generator) -> tuple[Array, Array, Array]:
