@@ -23,7 +23,7 @@ from service.web_page import EXAMPLE
 
 BEFORE_AFTER = Path(__file__).resolve().parents[2] / "pictures/before_after.webp"
 VIEWS, SIZE, NOISE, SEED = 40, 512, 0.03, 3
-OPTIONS = {"max_image_size": SIZE, "orbit_frames": 0, "verdict": False}
+OPTIONS = {"preset": "fast", "max_image_size": SIZE, "orbit_frames": 0}
 SIDE, GAP, CAPTION, CROP = 340, 8, 26, 120  # px; the crop is of the render
 
 
@@ -32,25 +32,16 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         scene, out = Path(temporary, "scene"), Path(temporary, "out")
         make_scene(scene, "still-life", own=None, views=VIEWS, size=SIZE, noise=NOISE, seed=SEED)
-        result = biresnerf.refine(
-            scene, out, progress=True, preset="fast", max_image_size=SIZE, orbit_frames=0
-        )
+        result = biresnerf.refine(scene, out, progress=True, **OPTIONS)
         straight = shutil.copytree(scene, Path(temporary, "straight"))
         shutil.copyfile(out / "transforms.json", straight / "transforms.json")
-        fields = [
-            biresnerf.refine(
-                poses,
-                Path(temporary, name),
-                progress=True,
-                preset="fast",
-                start="given",
-                fixed=result.names,
-                **OPTIONS,
-            )
+        still = {**OPTIONS, "start": "given", "fixed": result.names, "verdict": False}
+        given, refined = (
+            biresnerf.refine(poses, Path(temporary, name), progress=True, **still)
             for poses, name in ((scene, "given"), (straight, "refined"))
-        ]
+        )
         turned = float(np.median(rotation_between_deg(result.poses_before, result.poses)))
-        draw_before_after(*fields, turned, BEFORE_AFTER)
+        draw_before_after(given, refined, turned, BEFORE_AFTER)
 
 
 def draw_before_after(given: Result, refined: Result, turned: float, path: Path) -> None:
@@ -61,15 +52,14 @@ def draw_before_after(given: Result, refined: Result, turned: float, path: Path)
     views = {view.image: view for view in read_view_file(refined.folder).views if view.held_out}
     before = next(view for view in read_view_file(given.folder).views if view.image in views)
     after = views[before.image]
-    files = (
-        given.folder / before.pictures.render,
-        refined.folder / after.pictures.render,
-        refined.folder / after.pictures.photo,
-    )
     pictures = {}
-    for kind, file in zip(("given", "refined", "photo"), files, strict=True):
+    for name, file in (
+        ("given", given.folder / before.pictures.render),
+        ("refined", refined.folder / after.pictures.render),
+        ("photo", refined.folder / after.pictures.photo),
+    ):
         with Image.open(file) as opened:
-            pictures[kind] = opened.convert("RGB")
+            pictures[name] = opened.convert("RGB")
     keep_unseen(pictures, EXAMPLE)
     captions = (f"given poses, {turned:.1f}° off", "refined poses", "photo, not used in training")
     x, y = most_different(*(np.asarray(pictures[kind], np.float64) for kind in ("given", "refined")))
