@@ -11,9 +11,8 @@ from biresnerf.judging.compare import FACING_FORWARD, FACING_FORWARD_BOUNDED, Ru
 class SceneKind:
     """The numbers of a scene with a background; `OPEN` has those of an open one."""
 
-    coarse_interval: float = (
-        2.5e-2  # ray marching interval at the start, unit lengths: half a cell of the pose module
-    )
+    # Ray marching interval at the start, unit lengths: half a cell of the pose module.
+    coarse_interval: float = 2.5e-2
     interval_pixels: float = 0.4  # of a pixel: the interval is no finer
     samples: int = 1  # times the samples of a step that the options ask for
     pose_start: float = 0.0  # of the least length of stage 1, over which the poses' rate rises at the least

@@ -12,9 +12,8 @@ class StartNumbers:
     # Right poses explain so many of the matches that no mapping was shown, wrong ones fewer: 0.95 to 0.98 on five sets,
     # and 0.56 to 0.59 for coffee's wrong models (docs/input.md).
     explains: float = 0.9
-    moving_steps: int = (
-        400  # of trainings in which the candidates' poses move, where those at rest do not decide
-    )
+    # Of trainings in which the candidates' poses move, where those at rest do not decide.
+    moving_steps: int = 400
     # Where matches placed most cameras, stage 1 has only to form the field: its lengths shrink to this share.
     matched_coarse_share: float = 2 / 3
     facing_first_steps: int = 800  # of cameras that begin at one place
@@ -37,9 +36,8 @@ class ViewNumbers:
     # Times the fine interval that a short training's field is rendered at, for 0.4 to 0.8 of the time: unseen views
     # keep their PSNR to 0.06 dB (fox, lego, fountain-P11). Trained at it, too, fountain-P11 loses 0.7 dB.
     coarser: float = 2.0
-    rays_per_step: int = (
-        100  # pixels of all unseen views that are rendered at the end, for each step of the training
-    )
+    # Pixels of all unseen views that are rendered at the end, for each step of the training.
+    rays_per_step: int = 100
     hold_out_one_in: int = 10  # views of a run, to be scored
     hold_out_most: int = 10  # of them
     hold_out_from: int = 6  # photos; none of fewer

@@ -39,9 +39,8 @@ class ErrorNumbers:
 
     stands_out: float = 2.0  # times the median error
     stands_out_untrained: float = 4.0  # for held-out views too few to be compared with each other
-    deviations: float = (
-        4.0  # and this many standard deviations, estimated as 1.4826 x the median absolute deviation
-    )
+    # And this many standard deviations, estimated as 1.4826 x the median absolute deviation.
+    deviations: float = 4.0
     suspect_deviations: float = 2.0  # enough to try other poses, which are judged on their own
     # A photo that is hard to render stands out late in a run, when others are nearly exact (0.03 at most on lego and
     # temple); a camera in a wrong place leaves this share of its photo's variance unexplained (0.12 and more there).
@@ -50,9 +49,8 @@ class ErrorNumbers:
     unexplained_untrained: float = 0.7
     own_yardstick_from: int = 4  # held-out views
     in_a_row: int = 2  # blocks
-    coverage: float = (
-        0.1  # of the photo's foreground share: a camera that renders less no longer sees the scene
-    )
+    # Of the photo's foreground share: a camera that renders less no longer sees the scene.
+    coverage: float = 0.1
     doubted_weight: float = 0.1  # of a camera with a guessed pose, until it agrees with the field
     smoothing: float = 0.5  # share of the newest block in the moving average
 

@@ -35,9 +35,8 @@ class ParameterNumbers:
     # exposure stay below (0.02 to 0.03 in fern, horns, lund_door), with nothing to gain.
     exposure_from: float = 0.03
     exposure_rate: float = 1.0  # of the networks' learning rate
-    exposure_prior: float = (
-        1e-4  # weight of the squared logarithms: photos without evidence stay like the others
-    )
+    # Weight of the squared logarithms: photos without evidence stay like the others.
+    exposure_prior: float = 1e-4
     exposure_most: float = 3.0  # factor; a camera that does not see the scene would accept any
     saturated: float = 0.99  # a photo as bright as this may have been brighter
     # Expected standard deviations of the lenses' increments, and the weight of this prior in the loss: parameters
