@@ -301,12 +301,15 @@ def test_a_fork_goes_on_after_stage_1_and_its_end_on_request_leaves_a_partial_re
 
 # Last: from then on the service asks everybody for a key.
 def test_a_service_with_keys_is_used_with_one_and_a_result_is_shared_without(
-    tab: Watched, browser: Browser, service: Running, job_url: str, done: dict[str, Any]
+    tab: Watched, browser: Browser, service: Running, job_url: str, done: dict[str, Any], api: httpx.Client
 ) -> None:
     with ThreadPoolExecutor(1) as aside:  # Playwright's own loop runs in this thread
         made = aside.submit(operator, service.data_dir, "keys", "create", "page", "--tenant", "local")
         key = made.result()["key"]
     page = tab.page
+    # The service asks only now and then whether the first key has been made.
+    while api.get("/jobs").status_code != 401:
+        page.wait_for_timeout(200)
     page.goto(job_url)
     field = page.get_by_label("API key")
     field.fill("brn_wrong")
