@@ -81,7 +81,7 @@ def refine_poses(
     *,
     method: Method | None = None,
     keep_reusable: bool = False,
-    overwrite: bool = False,
+    title: str | None = None,
 ) -> Report:
     """Refine the poses of an image set; all results go to the folder `output`.
 
@@ -97,7 +97,7 @@ def refine_poses(
         observer: looks into the run, for comparisons with the truth.
         method: in place of the one that the options name, e.g. ``dataclasses.replace(BIRESNERF, repair=False)``.
         keep_reusable: leave in `output`/checkpoint what other runs of the set can start from.
-        overwrite: remove a finished result from `output` first.
+        title: heading of the report; by default the name of the folder of a set already read.
 
     Raises:
         InputError: the user can fix it.
@@ -106,10 +106,9 @@ def refine_poses(
             yet where initial poses were still being looked for.
     """
     started, share = time.monotonic(), ProcessorShare()
-    title = _title_of(input.root) if isinstance(input, Dataset) else None
+    if title is None and isinstance(input, Dataset):
+        title = _title_of(input.root)
     folder = OutputFolder(Path(output), keep_reusable=keep_reusable, title=title)
-    if overwrite:
-        folder.remove_result()
     with share.watching(), KernelCompilation() as kernels:
         setup = _set_up(folder, options, method, on_progress, should_stop, share, kernels)
         return _refine(input, setup, observer or Observer(), started)

@@ -66,8 +66,9 @@ def refine(
     let_waiting_threads_sleep()
     own = None if isinstance(method, str) else method
     asked = parse_options(options if own else {"method": method, **options})
+    folder = OutputFolder(Path(output))
     if not overwrite:
-        OutputFolder(Path(output)).refuse_finished()
+        folder.refuse_finished()
     with ExitStack() as during:
         on_progress = during.enter_context(ShownProgress()) if progress is True else progress or None
         stop = should_stop or during.enter_context(StopRequest(signal.SIGINT))
@@ -78,5 +79,7 @@ def refine(
             dataset, asked = joined_to(dataset, asked, Path(fixed_from))
         from biresnerf.pipeline import refine_poses  # loads torch, which takes seconds
 
-        refine_poses(dataset, output, asked, on_progress, stop, method=own, overwrite=overwrite)
+        if overwrite:
+            folder.remove_result()
+        refine_poses(dataset, output, asked, on_progress, stop, method=own)
     return load(output)

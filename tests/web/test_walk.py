@@ -104,6 +104,14 @@ def test_ticked_images_are_held_or_left_out_in_another_run(desktop: Watched, don
     expect_ticked_images_in_another_run(desktop.page)
 
 
+def test_the_report_to_open_offline_is_headed_by_the_sets_name(
+    done: dict[str, Any], api: httpx.Client
+) -> None:
+    page = api.get(f"/jobs/{done['id']}/artifacts/report.html", follow_redirects=True).text
+    assert done["labels"]["name"] == "kitchen"
+    assert "<title>kitchen</title>" in page
+
+
 def test_the_verdict_is_the_reports(desktop: Watched, done: dict[str, Any], api: httpx.Client) -> None:
     said = api.get(f"/jobs/{done['id']}/report").json()["verdict"]
     assert said["verdict"] == done["verdict"]

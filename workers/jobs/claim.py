@@ -25,7 +25,7 @@ class Fenced(BaseException):
 class Claim:
     """One attempt of one job, owned by whoever holds ``token``.
 
-    ``options`` are as requested; the job's process resolves them for its device.
+    ``options`` are as requested; the job's process resolves them for its device. ``title`` heads the report.
     """
 
     job_id: str
@@ -41,6 +41,7 @@ class Claim:
     reusable: dict[str, Any]
     forked_stage: ReusableStage | None
     trace: str | None
+    title: str | None
 
     @property
     def name(self) -> str:
@@ -99,6 +100,7 @@ def _claimed(row: dict[str, Any], token: uuid.UUID) -> Claim:
         row["id"],
         token=token,
         forked_stage=row["forked_stage"],
+        title=row["labels"].get("name"),
         **{name: row[name] for name in (*same, *also)},
     )
 

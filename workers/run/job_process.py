@@ -47,6 +47,7 @@ class Order(FrozenModel):
     output: Path
     options: dict[str, object]
     result: Path | None = None  # that is exported, or whose poses stay
+    title: str | None = None  # of the report
 
 
 def main(folder: Path) -> int:
@@ -141,6 +142,7 @@ def _refine(order: Order, options: RefineOptions, protocol: TextIO, stop: _Stop)
             on_progress=tell,
             should_stop=stop.asked.is_set,
             keep_reusable=True,
+            title=order.title,
         )
     finally:
         _give_video_frames(order)

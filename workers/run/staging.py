@@ -28,7 +28,7 @@ async def stage_job(database: Database, files: FileStore, claim: Claim, folder: 
     for name in ("input", "output", "tmp"):
         (folder / name).mkdir(parents=True)
     options = {**claim.options, **claim.smaller}
-    order: dict[str, Any] = {"input": "input", "output": "output", "options": options}
+    order: dict[str, Any] = {"input": "input", "output": "output", "options": options, "title": claim.title}
     if claim.kind == "export":
         order |= {"task": "export", "result": "result"}
         await _stage_result(files, await _parents_files(database, claim), EXPORTED_FROM, folder / "result")

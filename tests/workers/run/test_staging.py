@@ -30,3 +30,17 @@ async def test_the_process_gets_the_options_that_were_sent_so_that_it_can_fill_i
     order = json.loads((tmp_path / "job" / "job.json").read_text())
     assert order["options"] == {"preset": "fast", "steps": 500}
     assert (tmp_path / "job" / "input" / "a.txt").read_bytes() == b"photo"
+
+
+async def test_the_process_is_told_what_the_user_calls_the_set(
+    stores: Stores, settings: Settings, tmp_path: Path
+):
+    dataset_id = await ready_dataset(stores, {"a.txt": b"photo"})
+    for name in ({}, {"name": "kitchen"}):
+        job, _ = await stores.jobs.submit(dataset_id, RefineOptions(preset="fast"), labels=name)
+        await taken_by_somebody(stores.jobs._database)
+        claim = await claimed(stores.jobs._database, job.id)
+        assert claim is not None
+        await stage_job(stores.jobs._database, stores.files, claim, tmp_path / "job")
+        order = json.loads((tmp_path / "job" / "job.json").read_text())
+        assert order["title"] == name.get("name")
