@@ -1,4 +1,4 @@
-"""The tables of formats in docs/formats.md and the page's lists of them, from the formats' declarations."""
+"""The list and table of formats in docs/formats.md and the web page's lists of them, from the formats' declarations."""
 
 from __future__ import annotations
 
@@ -13,15 +13,21 @@ from docs.generate.markdown import DASH, table
 _TESTS = Path(__file__).resolve().parents[2] / "tests"
 _NAMES = {"bpy": "Blender", "gaussian-splatting": "3D Gaussian Splatting", "open3d": "Open3D"}
 _END = "<!-- end -->"
+_USUAL = "poses and lenses"  # what formats give where the page says nothing
+_MADE_FROM = (
+    "its ",
+    "their ",
+    "the programs' ",
+)  # the source, manual or writer of the format: the page says so of all
 _RARE: dict[Loss, str] = {  # the sentence below the table names the formats that hold them
     "rigs": "rigs",
     "mask paths": "paths of masks",
 }
 _LOSSES: dict[Loss, str] = {
     "poses": "poses",
-    "names": "names: rows follow the order of the files' names",
+    "names": "names",
     "lenses": "lenses",
-    "some lenses": "lenses other than [these](#camera-models)",
+    "some lenses": "[other lenses](#camera-models)",
     "distortion": "distortion",
     "points": "points",
     "masks": "masks",
@@ -29,17 +35,17 @@ _LOSSES: dict[Loss, str] = {
 _NEEDS: dict[Need, str] = {
     "photos": "the photos",
     "images folder": "photos directly in `images/`",
-    "lens file": "`camera.json` for the lens",
+    "lens file": "`camera.json`",
     "bounds": "depth bounds",
     "input": "the input's keys",
 }
 
 
 def format_page(path: Path) -> str:
-    """docs/formats.md with its generated tables as they should be now."""
+    """docs/formats.md with its generated parts as they should be now."""
     text = path.read_text("utf-8")
     tables = {
-        "formats read": _read_table(),
+        "formats read": _read_list(),
         "formats written": _write_table(),
     }
     for name, content in tables.items():
@@ -49,19 +55,18 @@ def format_page(path: Path) -> str:
     return text
 
 
-def _read_table() -> str:
-    rows = [
-        (
-            one.title,
-            ", ".join("the folder itself" if name == "." else f"`{name}`" for name in one.found_as),
-            one.gives,
-            one.checked_against,
-        )
-        for one in formats().values()
-        if one.found_as
-    ]
-    rows.append(("images alone", "the folder itself, `images/`", "sizes, EXIF", ""))
-    return table(("format", "found as", "what it gives", "checked against"), rows)
+def _read_list() -> str:
+    rows = [_reading(one) for one in formats().values() if one.found_as]
+    return "\n".join([*rows, "- **images alone**: sizes, EXIF"]) + "\n"
+
+
+def _reading(one: Format) -> str:
+    """One line of the list: where the format is found, what it gives, and the files that its reader was tested with."""
+    names = ", ".join("the folder" if name == "." else f"`{name}`" for name in one.found_as)
+    found = "" if one.found_as == (one.title.split()[0],) else f" ({names})"
+    gives = f": {one.gives}" if one.gives != _USUAL else ""
+    files = "; ".join(part for part in one.checked_against.split("; ") if not part.startswith(_MADE_FROM))
+    return f"- **{one.title}**{found}{gives}" + (f" [{files}]" if files else "")
 
 
 def _readers() -> dict[str, list[str]]:
@@ -85,13 +90,13 @@ def _readers() -> dict[str, list[str]]:
 def _write_table() -> str:
     readers = _readers()
     written = [one for one in formats().values() if one.in_set or one.in_result]
-    head = ("format", "file in a result", "written", "for", "cannot hold", "opened by")
+    head = ("format", "file in a result", "cannot hold", "opened by")
     rows = [
         (
             f"`{one.name}`",
-            f"`{one.in_result}`" + (f" (`convert`: `{one.in_set}`)" if one.in_set != one.in_result else ""),
-            _when(one),
-            one.heading.removeprefix("For "),
+            f"`{one.in_result}`"
+            + (f" (`convert`: `{one.in_set}`)" if one.in_set != one.in_result else "")
+            + (f", needs {', '.join(_NEEDS[need] for need in one.needs)}" if one.needs else ""),
             "; ".join(
                 [_LOSSES[loss] for loss in one.loses if loss not in _RARE] + [one.lacks] * bool(one.lacks)
             )
@@ -104,12 +109,12 @@ def _write_table() -> str:
         f"{words} ({', '.join(f'`{one.name}`' for one in written if _holds(one, loss))})"
         for loss, words in _RARE.items()
     ]
-    return f"{table(head, rows)}\nOnly some hold {' and '.join(held)}.\n"
-
-
-def _when(one: Format) -> str:
-    when = "always" if one.always else "on request" if one.on_request else "where the input has it"
-    return when + (f"; needs {', '.join(_NEEDS[need] for need in one.needs)}" if one.needs else "")
+    always = ", ".join(f"`{one.name}`" for one in written if one.always)
+    of_input = ", ".join(f"`{one.name}`" for one in written if not (one.always or one.on_request))
+    return (
+        f"{table(head, rows)}\nAlways written: {always}. With such an input: {of_input}. Others: on request.\n"
+        f"Only some hold {' and '.join(held)}.\n"
+    )
 
 
 def _holds(one: Format, loss: Loss) -> bool:

@@ -73,7 +73,7 @@ POLYCAM = Format(
     title="Polycam raw data",
     rank=85,
     found_as=("keyframes/corrected_cameras", "corrected_cameras", "keyframes/cameras", "cameras"),
-    gives="poses and lenses, those that Polycam corrected where it has them",
+    gives="those that Polycam corrected, where it has them",
     checked_against="nerfstudio's reader",
     axes="opengl",
 )

@@ -28,7 +28,7 @@ MATRIX_FILES = Format(
     title="a 4 × 4 per image (ScanNet, 7-Scenes, NSVF, NeRF++, 3DMatch, MobileBrick)",
     rank=83,
     found_as=("pose", "poses", "."),
-    gives="poses; one lens, or one an image, from the intrinsics beside them",
+    gives="poses; intrinsics beside them",
     checked_against="the programs' sources; andyzeng/tsdf-fusion-python, andyzeng/3dmatch-toolbox, borglab/gtsfm",
 )
 _HINT = "Give a file of 4 rows of 4 numbers for each image, camera to world."

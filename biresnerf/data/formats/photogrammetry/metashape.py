@@ -36,7 +36,7 @@ METASHAPE = Format(
     rank=70,
     found_as=("*.xml",),
     suffixes=(".xml",),
-    gives="poses, cameras of type frame, from a camera export (XML)",
+    gives="a camera export, cameras of type frame",
     checked_against="its manual; KU-Leuven-Geomatics/geomapi, bitbyt3r/metashape-automation (skew)",
 )
 

@@ -29,7 +29,7 @@ REALITYCAPTURE_XMP = Format(
     title="RealityCapture XMP",
     rank=66,
     found_as=("images", "."),
-    gives="poses and lenses, from an .xmp beside each photo",
+    gives="an .xmp beside each photo",
     checked_against="its article on camera maths; KU-Leuven-Geomatics/geomapi",
 )
 _HINT = "Export the XMP again, with poses and Brown3 distortion or none."

@@ -48,7 +48,7 @@ FEED_FORWARD = Format(
     rank=96,
     found_as=("predictions.npz", "results.npz", "exports/npz/results.npz", "exports/mini_npz/results.npz"),
     suffixes=(".npz",),
-    gives="poses; lenses as first guesses, carried from the scaled pictures to the photos",
+    gives="poses; lenses as first guesses",
     checked_against="their sources",
     cam_from_world=True,
 )
@@ -58,7 +58,7 @@ DUST3R = Format(
     rank=97,
     found_as=("poses.npz", "poses.npy", "camera_poses.npy", "cams2world.npy"),
     suffixes=(".npz", ".npy"),
-    gives="poses, with focals.npy, intrinsics.npy or pps.npy beside them; lenses as VGGT's",
+    gives="the same, lenses beside them",
     checked_against="their sources",
 )
 

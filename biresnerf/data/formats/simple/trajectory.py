@@ -46,7 +46,7 @@ TRAJECTORY = Format(
         "[0-9][0-9].txt",
     ),
     suffixes=(".txt",),
-    gives="poses, TUM's times; a camera from the file beside it, KITTI's in `calib.txt`",
+    gives="poses, TUM's times; a lens beside them",
     checked_against="SciPy's quaternions (TUM); its description (KITTI)",
 )
 TUM = Format(
