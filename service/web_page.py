@@ -33,6 +33,8 @@ _MEDIA_TYPES = {
     ".jpg": "image/jpeg",
     ".png": "image/png",
     ".bin": "application/octet-stream",
+    ".mp4": "video/mp4",
+    ".zip": "application/zip",
 }
 # Best first; the build writes a compressed copy of a file where that is smaller.
 _ENCODINGS = {"br": ".br", "gzip": ".gz"}

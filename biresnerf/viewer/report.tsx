@@ -34,7 +34,6 @@ function ReportPage({ data, licences }: { data: Embedded; licences: string }) {
   });
   const urlOf = useCallback((file: string) => files[file] ?? null, [files]);
   const history = useMemo(() => historyOf(data.history), [data]);
-  const orbit = view?.orbit ? files[view.orbit] : undefined;
   return (
     <>
       <header class="report-head">
@@ -45,12 +44,6 @@ function ReportPage({ data, licences }: { data: Embedded; licences: string }) {
       </header>
       <main>
         <ResultView {...{ report, view, points, history, urlOf }} poses={data.poses} />
-        {orbit && (
-          <div class="panel">
-            <h2>Orbit</h2>
-            <video class="orbit" src={orbit} poster={files[view?.views[0]?.pictures.render ?? ""]} controls loop muted playsInline aria-label="A flight around the scene" />
-          </div>
-        )}
         <Notes title="Not in this file" lines={data.left_out} />
         <details class="panel">
           <summary>Options</summary>

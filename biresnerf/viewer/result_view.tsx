@@ -1,6 +1,7 @@
 // All views of one finished result: in report.html, and of the example on the service's page.
 import { useState } from "preact/hooks";
 import type { PosesDocument, Report, ViewFile } from "schemas";
+import { OrbitVideo } from "./result/orbit_video";
 import { type CurvePoint, type PointLayer, type UrlOf, useWidgetData } from "./result/widget_data";
 import { SceneView } from "./scene/scene_view";
 import { Curves } from "./widgets/curves";
@@ -37,6 +38,12 @@ export function ResultView({ poses, report, view, points, history, urlOf }: Prop
           <SceneView {...{ cameras, points, cellOf, photoOf, ...choice }} />
         </div>
       </div>
+      {view?.orbit && urlOf(view.orbit) && (
+        <div class="panel">
+          <h2>Flight around the scene</h2>
+          <OrbitVideo {...{ view, urlOf }} />
+        </div>
+      )}
       <div class="panel">
         <h2>Images</h2>
         <ImageTable rows={rows} cellOf={cellOf} {...choice} />

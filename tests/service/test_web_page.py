@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import re
+import zipfile
 from pathlib import Path
 
 import httpx
+import numpy as np
 import pytest
 
 from biresnerf.data.model.untrusted_file import read_json_object
@@ -82,14 +84,28 @@ def test_the_example_reads_as_a_result_and_is_small() -> None:
     poses = read_json_object(web_page.EXAMPLE / view.poses)
     assert [image["name"] for image in poses["images"]] == [image.name for image in report.images]
     assert all(len(read_points(web_page.EXAMPLE, points)[0]) for points in view.points)
+    assert view.orbit is not None
     assert sum(path.stat().st_size for path in web_page.EXAMPLE.rglob("*") if path.is_file()) < 1_000_000
+
+
+def test_the_examples_colmap_model_has_the_refined_poses(tmp_path: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    with zipfile.ZipFile(web_page.EXAMPLE / "colmap.zip") as archive:
+        archive.extractall(tmp_path)
+    model = pycolmap.Reconstruction(tmp_path / "colmap/sparse/0")
+    in_model = {Path(one.name): one.cam_from_world().inverse().matrix() for one in model.images.values()}
+    poses = read_json_object(web_page.EXAMPLE / "poses.json")
+    refined = {Path(image["file_name"]): image["world_from_cam"] for image in poses["images"]}
+    assert in_model.keys() == refined.keys()
+    for name, world_from_cam in in_model.items():
+        np.testing.assert_allclose(world_from_cam, np.asarray(refined[name])[:3], atol=1e-6)
 
 
 def test_the_example_is_answered_whole_to_those_without_a_key_and_nothing_else_is(closed: Running) -> None:
     view = read_view_file(web_page.EXAMPLE)
     assert view.contact_sheet is not None
     named = {view.poses, "report.json", "history.jsonl", view.contact_sheet.file}
-    named |= {points.file for points in view.points}
+    named |= {points.file for points in view.points} | {str(view.orbit), "colmap.zip", "transforms.json"}
     named |= {file for shown in view.views for file in shown.pictures.files().values()}
     with client_with(closed, None) as stranger:
         for name in named:

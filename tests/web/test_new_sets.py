@@ -79,6 +79,10 @@ def test_a_finished_example_is_one_click_away_and_needs_no_job(
     )
     page.get_by_role("slider", name="Swipe between photo and render").press("Home")
     expect(page.locator(".curves canvas").first).to_be_visible()
+    film = page.get_by_label("A flight around the scene")
+    film.evaluate("film => film.play()")
+    page.wait_for_function("film => film.currentTime > 0", arg=film.element_handle())
+    film.evaluate("film => film.pause()")
     tab.screenshot("example")
     assert tab.findings() == []
     assert (tab.outside, tab.complaints) == ([], [])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -11,7 +12,8 @@ from PIL import Image
 from biresnerf.data.show.history import HISTORY
 from biresnerf.data.show.view_file import ShownView, read_view_file, write_view_file
 
-DOWNLOADS = ("transforms.json",)  # beside poses.json
+DOWNLOADS = ("transforms.json",)  # beside poses.json and the model
+MODEL, MODEL_ARCHIVE = "colmap/sparse/0", "colmap.zip"
 UNSEEN, UNSEEN_SIDE = "unseen", 320  # px
 SHOWN, QUALITY = 4, 85  # views, and JPEG quality of their pictures
 
@@ -31,12 +33,20 @@ def keep_example(result: Path, example: Path) -> None:
         "report.json",
         HISTORY,
         *sheet,
+        *([view.orbit] if view.orbit else []),
         *(points.file for points in view.points),
     ):
         (example / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(result / name, example / name)
+    _keep_model(result, example / MODEL_ARCHIVE)
     views = tuple(_with_small_pictures(one, result, example) for one in view.views[:SHOWN])
-    write_view_file(view.model_copy(update={"views": views, "orbit": None}), example)
+    write_view_file(view.model_copy(update={"views": views}), example)
+
+
+def _keep_model(result: Path, archive: Path) -> None:
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as packed:
+        for file in sorted((result / MODEL).iterdir()):
+            packed.write(file, file.relative_to(result))
 
 
 def keep_unseen(pictures: Mapping[str, Image.Image], example: Path) -> None:

@@ -1,6 +1,7 @@
-"""The README's first picture: `python -m docs.generate.pictures.refined_scene` refines a made still life.
+"""The README's before and after: `python -m docs.generate.pictures.refined_scene` refines a made still life.
 
-Takes about ten minutes. Writes docs/pictures/before_after.webp, and the same view for the start page.
+Takes about ten minutes. Writes docs/pictures/before_after.webp, the same view for the start page, and the film
+docs/pictures/flight.webp.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import shutil
 import tempfile
 from pathlib import Path
 
+import imageio.v2 as imageio
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
@@ -18,13 +20,16 @@ from biresnerf.commands.poses.make_scene import make_scene
 from biresnerf.data.show.view_file import read_view_file
 from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.result import Result
+from biresnerf.write.output_folder import ORBIT
 from docs.generate.pictures.example import keep_unseen
 from service.web_page import EXAMPLE
 
-BEFORE_AFTER = Path(__file__).resolve().parents[2] / "pictures/before_after.webp"
+PICTURES = Path(__file__).resolve().parents[2] / "pictures"
+BEFORE_AFTER, FLIGHT = PICTURES / "before_after.webp", PICTURES / "flight.webp"
 VIEWS, SIZE, NOISE, SEED = 40, 512, 0.03, 3
 OPTIONS = {"preset": "fast", "max_image_size": SIZE, "orbit_frames": 0}
 SIDE, GAP, CAPTION, CROP = 340, 8, 26, 120  # px; the crop is of the render
+FRAMES, FRAME_MS, FRAME_SIDE = 60, 90, 256
 
 
 def main() -> None:
@@ -35,13 +40,14 @@ def main() -> None:
         result = biresnerf.refine(scene, out, progress=True, **OPTIONS)
         straight = shutil.copytree(scene, Path(temporary, "straight"))
         shutil.copyfile(out / "transforms.json", straight / "transforms.json")
-        still = {**OPTIONS, "start": "given", "fixed": result.names, "verdict": False}
+        still = {**OPTIONS, "start": "given", "fixed": result.names, "verdict": False, "orbit_frames": FRAMES}
         given, refined = (
             biresnerf.refine(poses, Path(temporary, name), progress=True, **still)
             for poses, name in ((scene, "given"), (straight, "refined"))
         )
         turned = float(np.median(rotation_between_deg(result.poses_before, result.poses)))
         draw_before_after(given, refined, turned, BEFORE_AFTER)
+        draw_flight(given.folder / ORBIT, refined.folder / ORBIT, FLIGHT)
 
 
 def draw_before_after(given: Result, refined: Result, turned: float, path: Path) -> None:
@@ -75,6 +81,23 @@ def draw_before_after(given: Result, refined: Result, turned: float, path: Path)
         crop = picture.crop((x, y, x + CROP, y + CROP)).resize((SIDE, SIDE), Image.Resampling.LANCZOS)
         sheet.paste(crop, (left, CAPTION + SIDE + GAP))
     sheet.save(path, quality=82, method=6)
+
+
+def draw_flight(given: Path, refined: Path, path: Path) -> None:
+    """Two films side by side, as one that any page plays."""
+    frames = []
+    for pair in zip(imageio.get_reader(given), imageio.get_reader(refined), strict=True):
+        frame = Image.new("RGB", (2 * FRAME_SIDE + GAP, CAPTION + FRAME_SIDE), "white")
+        draw, font = ImageDraw.Draw(frame), ImageFont.load_default(17)
+        for column, (picture, caption) in enumerate(zip(pair, ("given poses", "refined poses"), strict=True)):
+            left = column * (FRAME_SIDE + GAP)
+            draw.text((left + 4, CAPTION // 2), caption, "black", font, anchor="lm")
+            small = Image.fromarray(picture).resize((FRAME_SIDE, FRAME_SIDE), Image.Resampling.LANCZOS)
+            frame.paste(small, (left, CAPTION))
+        frames.append(frame)
+    frames[0].save(
+        path, save_all=True, append_images=frames[1:], duration=FRAME_MS, loop=0, quality=62, method=6
+    )
 
 
 def most_different(one: Array, other: Array) -> tuple[int, int]:

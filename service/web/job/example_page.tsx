@@ -7,9 +7,10 @@ import { ProblemBox } from "../parts/problem_box";
 import { useTitle } from "../parts/title";
 
 const fileOf = (name: string) => `example/${name}`;
-/** A job of yours has these and more, among them a COLMAP model and a report to open offline. */
+/** A job of yours has these and more, among them a report to open offline. */
 const DOWNLOADS = [
   ["transforms.json", "the set's own file with the refined poses, for nerfstudio and instant-ngp"],
+  ["colmap.zip", "a COLMAP model, for gsplat, 3DGS, Metashape and Blender"],
   ["poses.json", "poses before and after, with the accuracy of each"],
 ] as const;
 const urlOf = (name: string) => address(fileOf(name));

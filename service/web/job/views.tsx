@@ -2,6 +2,7 @@
 import type { ComponentChildren } from "preact";
 import { useState } from "preact/hooks";
 import type { ArtifactView, JobView, PosesDocument, ViewFile } from "schemas";
+import { OrbitVideo } from "../../../biresnerf/viewer/result/orbit_video";
 import { type UrlOf, useWidgetData } from "../../../biresnerf/viewer/result/widget_data";
 import { once, useLoaded } from "../api/hooks";
 import { shared } from "../api/http";
@@ -74,29 +75,20 @@ export function JobViews({ seen, urlOf }: { seen: LiveState; urlOf: UrlOf }) {
           <Images {...{ job, widgets, rows, cellOf, ...choice }} />
         </Panel>
       )}
-      {view && <Orbit view={view} urlOf={urlOf} />}
+      {view?.orbit && <Flight view={view} urlOf={urlOf} />}
     </>
   );
 }
 
-/** The video, fetched when it is opened. */
-function Orbit({ view, urlOf }: { view: ViewFile; urlOf: UrlOf }) {
+/** The film, fetched when it is opened. */
+function Flight({ view, urlOf }: { view: ViewFile; urlOf: UrlOf }) {
   const [open, setOpen] = useState(false);
-  if (!view.orbit) return null;
-  const [url, poster] = open ? [urlOf(view.orbit), urlOf(view.views[0]?.pictures.render ?? "")] : [null, null];
   return (
     <details class="panel" onToggle={(event) => setOpen(event.currentTarget.open)}>
       <summary>
-        <h2>Orbit</h2>
+        <h2>Flight around the scene</h2>
       </summary>
-      {url && (
-        <video
-          class="orbit"
-          {...{ src: url, ...(poster && { poster }), controls: true, loop: true, muted: true }}
-          playsInline
-          aria-label="A flight around the scene"
-        />
-      )}
+      {open && <OrbitVideo {...{ view, urlOf }} />}
     </details>
   );
 }
