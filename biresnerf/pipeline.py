@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from biresnerf.arrays import Array
 from biresnerf.compile_kernels import KernelCompilation
 from biresnerf.data.formats.positions.control_points import control_points
 from biresnerf.data.formats.positions.known_distance import KnownDistance
@@ -32,7 +33,7 @@ from biresnerf.forecast.run_forecast import TELLING_S, Forecast
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.progress import Monitor, OnProgress, Progress, told_before_the_run
 from biresnerf.refinement.finish.rounds import run_rounds
-from biresnerf.refinement.finish.work_ahead import expect_rest, expect_run, keep_to_budget
+from biresnerf.refinement.finish.work_ahead import WorkAhead, expect_run
 from biresnerf.refinement.lost.lost_cameras import LostCameraRepair
 from biresnerf.refinement.lost.own_matches import OwnMatches
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
@@ -45,10 +46,11 @@ from biresnerf.refinement.stages.two_stages import TwoStages
 from biresnerf.refinement.start.choose_start import find_start
 from biresnerf.refinement.start.first_step import first_step, stage_lengths
 from biresnerf.refinement.verdict.evaluate import Evaluation, evaluate
-from biresnerf.refinement.verdict.judgement import judge
+from biresnerf.refinement.verdict.judgement import judge_poses
 from biresnerf.refinement.verdict.pose_uncertainty import pose_uncertainty
 from biresnerf.refinement.verdict.run_report import Findings, run_report
 from biresnerf.refinement.verdict.so_far import poses_so_far
+from biresnerf.refinement.views.evaluation import fit_held_out_poses
 from biresnerf.refinement.views.held_out_views import held_out_views
 from biresnerf.report import Report
 from biresnerf.resume import earlier_work, refuse_other_run, reusable_seeding, run_origin
@@ -63,11 +65,11 @@ class Observer:
     """Looks into a run on its way; the run does not depend on what it sees.
 
     Attributes:
-        at_check: what it returns at each check joins that check's line of the history.
+        at_check: what it returns of the poses [n, 4, 4] at each check joins that check's line of the history.
         at_end: called once, when the poses are final.
     """
 
-    at_check: Callable[[JointOptimiser], dict[str, float]] = lambda _optimiser: {}
+    at_check: Callable[[Array], dict[str, float]] = lambda _unit_from_cam: {}
     at_end: Callable[[Scene, JointOptimiser], None] = lambda _scene, _optimiser: None
 
 
@@ -128,31 +130,46 @@ def _refine(input: str | Path | Dataset, setup: _Setup, observer: Observer, star
     dataset = replace(dataset, positions=position_priors(dataset), control=control_points(dataset))
     scene, origin = _seed(dataset, setup)
     stages = _first_step(scene, origin, setup, observer)
-    optimiser, repair, run = stages.optimiser, stages.repair, stages.run
-    keep_to_budget(scene, optimiser, run, started, setup.recipe.options.steps)
+    optimiser, run = stages.optimiser, stages.run
+    WorkAhead(scene, optimiser, run).keep_to_budget(started, setup.recipe.options.steps)
     run.spent("preparing", time.monotonic() - started)
 
     evaluation, judgement = Evaluation(), None
+
+    def written(found: Findings) -> Report:
+        """The report, after the result."""
+        renderer, recipe, at = optimiser.renderer, optimiser.recipe, optimiser.step_state()
+        report = run_report(scene, renderer, recipe, at, run.record, stages.repair.repaired, found)
+        return write_result(
+            setup.folder, scene, renderer.joint, setup.monitor, evaluation, report, found.so_far
+        )
+
     try:
         stages.run_stage_1()
         finish = run_rounds(stages, scene)
         observer.at_end(scene, optimiser)
         pictures = ResultPictures(setup.folder, scene)
-        evaluation = evaluate(scene, optimiser, run, pictures)
-        judgement = judge(scene, optimiser, run, finish)
-        if judgement is not None:
+        recipe, renderer = optimiser.recipe, optimiser.renderer
+        with run.timed("evaluating"):
+            run.report_evaluation(0.0)
+            fit_held_out_poses(optimiser, scene.excluded_from_training)
+            evaluation = evaluate(scene, renderer, recipe.options, run, pictures)
+        lost = optimiser.camera_errors.lost.cpu().numpy()
+        if recipe.options.verdict:
+            with run.timed("judging"):
+                judgement = judge_poses(
+                    scene, renderer, optimiser.sampler, recipe, int(lost.sum()), run, finish
+                )
             shown = pictures.write_before_after(evaluation.views, judgement.renders)
             evaluation = replace(evaluation, views=shown)
-        lost, told = optimiser.camera_errors.lost.cpu().numpy(), optimiser.method.uncertainty
-        known = pose_uncertainty(scene.dataset, optimiser.joint, finish, judgement, lost) if told else ()
-        found = Findings(evaluation.scores, judgement, finish, known)
-        report = run_report(scene, optimiser, run.record, repair.repaired, found)
-        report = write_result(setup.folder, scene, optimiser, setup.monitor, evaluation, report)
+        told = recipe.method.uncertainty
+        known = pose_uncertainty(scene.dataset, renderer.joint, finish, judgement, lost) if told else ()
+        report = written(Findings(evaluation.scores, judgement, finish, known))
     except Interrupted:
-        so_far = poses_so_far(scene, optimiser, run) if judgement is None else None
-        found = Findings(evaluation.scores, judgement, so_far=so_far)
-        report = run_report(scene, optimiser, run.record, repair.repaired, found)
-        write_result(setup.folder, scene, optimiser, setup.monitor, evaluation, report, so_far)
+        so_far = None
+        if judgement is None:
+            so_far = poses_so_far(scene, optimiser.joint, optimiser.camera_errors, optimiser.recipe, run)
+        written(Findings(evaluation.scores, judgement, so_far=so_far))
         raise
     remember_rates(setup.recipe.device.type, setup.recipe.threads, setup.monitor.forecast.measured(TELLING_S))
     return report
@@ -287,7 +304,7 @@ def _first_step(scene: Scene, origin: RunOrigin, setup: _Setup, observer: Observ
     if setup.earlier is not None:
         stages.restore(setup.earlier)
         # A partial result may hold these poses: they were measured after the checkpoint was written.
-        poses_so_far(scene, optimiser, run)
+        poses_so_far(scene, optimiser.joint, optimiser.camera_errors, optimiser.recipe, run)
         setup.monitor.report(Progress(stage="preparing", message=f"resuming at step {optimiser.step_index}"))
-    expect_rest(scene, optimiser, run)
+    WorkAhead(scene, optimiser, run).expect_all()
     return stages

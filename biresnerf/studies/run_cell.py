@@ -72,9 +72,8 @@ class TruthObserver:
         self.depth_error: float | None = None
         self.seconds = 0.0
 
-    def at_check(self, optimiser: JointOptimiser) -> dict[str, float]:
+    def at_check(self, poses: NDArray[np.float64]) -> dict[str, float]:
         """Errors after BARF's alignment, as in the tables: mean rotation and mean centre."""
-        poses = optimiser.poses.poses().numpy()
         errors = camera_errors(align_by_spread(poses, self.truth).apply_to_poses(poses), self.truth)
         return {
             "rotation_deg": float(errors.rotation_deg.mean()),

@@ -41,8 +41,10 @@ def write_preview(
 
     Returns the files, relative to the output folder.
     """
-    path, so_far = folder.preview, poses_so_far(scene, optimiser, run)
-    report = run_report(scene, optimiser, run.record, repair.repaired, Findings(so_far=so_far))
+    path, renderer, recipe = folder.preview, optimiser.renderer, optimiser.recipe
+    so_far = poses_so_far(scene, renderer.joint, optimiser.camera_errors, recipe, run)
+    found = Findings(so_far=so_far)
+    report = run_report(scene, renderer, recipe, optimiser.step_state(), run.record, repair.repaired, found)
     world_from_cam, dataset = so_far.offered(scene)
     write_transforms(dataset, world_from_cam, path / TRANSFORMS)
     write_poses_json(described(dataset, world_from_cam, report), path / POSES)
@@ -51,9 +53,7 @@ def write_preview(
     if run.history.path.is_file():
         write_text(path / HISTORY, run.history.path.read_text("utf-8").rstrip("\n"))
         names.append(HISTORY)
-    return tuple(
-        f"{PREVIEW}/{name}" for name in (*names, *_write_pictures(folder, scene, optimiser.renderer))
-    )
+    return tuple(f"{PREVIEW}/{name}" for name in (*names, *_write_pictures(folder, scene, renderer)))
 
 
 def _write_pictures(folder: OutputFolder, scene: Scene, renderer: Renderer) -> list[str]:

@@ -24,7 +24,7 @@ from biresnerf.data.show.view_pictures import write_contact_sheet, write_points,
 from biresnerf.geometry.body_offset import BodyOffset
 from biresnerf.geometry.similarity import Similarity
 from biresnerf.progress import Monitor, Progress
-from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.parameters.joint_parameters import JointParameters
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.start.refined_poses import RefinedPoses
 from biresnerf.refinement.verdict.evaluate import Evaluation
@@ -45,7 +45,7 @@ SOLID = 0.5  # opacity from which a depth means something
 def write_result(
     folder: OutputFolder,
     scene: Scene,
-    optimiser: JointOptimiser,
+    joint: JointParameters,
     monitor: Monitor,
     evaluation: Evaluation,
     report: Report,
@@ -68,10 +68,10 @@ def write_result(
     if complete:
         monitor.report(Progress(stage="exporting"))
     path = folder.path
-    write_text(path / CONFIG, optimiser.options.model_dump_json(indent=2))
-    found = so_far.refined if so_far is not None else RefinedPoses.now(scene.dataset, optimiser.joint)
+    write_text(path / CONFIG, report.options.model_dump_json(indent=2))
+    found = so_far.refined if so_far is not None else RefinedPoses.now(scene.dataset, joint)
     refined, refined_dataset = found.world_from_cam, found.dataset
-    surface = evaluation.surface(optimiser.frame.unit_from_world, found.input_from_optimised)
+    surface = evaluation.surface(joint.frame.unit_from_world, found.input_from_optimised)
     field = FieldPoints(*surface, refined) if np.isfinite(refined).all() else None
     returned, returned_dataset, poses, moved = refined, refined_dataset, POSES, None
     folder.remove_refined()  # of a partial result that this one follows
@@ -85,11 +85,11 @@ def write_result(
             _, moved = _write_poses(path / REFINED, scene, refined_dataset, refined, of_refined, field)
             poses = f"{REFINED}/{POSES}"
     # A run that is stopped must end soon: it leaves large exports out.
-    exports, watching = (optimiser.options.exports, monitor) if complete else ((), Monitor())
+    exports, watching = (report.options.exports, monitor) if complete else ((), Monitor())
     finite = np.isfinite(returned).all()
     reference = write_georeference(returned_dataset, returned, path) if finite else None
     control = control_report(returned_dataset, returned) if finite else None
-    distance = KnownDistance.of(optimiser.options.known_distance, scene.dataset)
+    distance = KnownDistance.of(report.options.known_distance, scene.dataset)
     scale = distance.scale(returned) if distance is not None else None
     report = report.model_copy(
         update={"geo_reference": reference, "control_points": control, "known_scale": scale}
@@ -105,7 +105,7 @@ def write_result(
     write_text(path / REPORT, report.model_dump_json(indent=2))
     if complete:
         folder.clean_up(failed=bool(report.faults))
-        monitor.report_end(optimiser.schedule.steps)
+        monitor.report_end(report.steps_done)
     return report
 
 

@@ -20,12 +20,10 @@ from biresnerf.field.radiance_field import Merging
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.judging.compare import Rule
 from biresnerf.refinement.finish.gather_evidence import without_patches
-from biresnerf.refinement.finish.work_ahead import checks_ahead
 from biresnerf.refinement.lost.lost_cameras import LostCameraRepair
 from biresnerf.refinement.optimise.method_changes import changed, differences
 from biresnerf.refinement.optimise.methods import BIRESNERF
 from biresnerf.refinement.start.first_step import stage_lengths
-from biresnerf.refinement.verdict.judgement import judge_poses
 from biresnerf.refinement.views.evaluation import fit_held_out_poses
 from biresnerf.studies.scenes import with_poses
 from tests.refinement.tiny_scene import (
@@ -201,7 +199,7 @@ def test_the_verdict_takes_for_unchanged_what_the_method_cannot_measure(tiny, tm
     dataset, images = tiny
     given = given_scene(dataset, images, given=perturb_poses(dataset.world_from_cam, 0.05, seed=1))
     noisy = replace(given, dataset=with_poses(dataset, given.start.world_from_cam))
-    verdict = judge_poses(*TinyRun(optimiser(tiny, {"verdict.measurable_px": 50.0}), noisy, tmp_path).parts)
+    verdict = TinyRun(optimiser(tiny, {"verdict.measurable_px": 50.0}), noisy, tmp_path).judged()
     assert verdict.verdict.moved_px > 2 * BIRESNERF.verdict.measurable_px
     assert verdict.verdict.verdict == "unchanged"
     assert "50 px" in verdict.verdict.why[0]
@@ -228,7 +226,7 @@ def test_photos_are_asked_about_motions_that_the_method_takes_for_seen(tiny, tmp
     asked = []
     for unseen_px in (0.0, 100.0):
         run = TinyRun(optimiser(tiny, {"finish.unseen_px": unseen_px}), scene, tmp_path)
-        asked.append(checks_ahead(*run.parts))
+        asked.append(run.ahead.checks())
     assert asked == [True, False]
 
 

@@ -18,6 +18,8 @@ from biresnerf.errors import Interrupted
 from biresnerf.forecast.run_forecast import Forecast
 from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.progress import Monitor
+from biresnerf.refinement.finish.outcome import Finish
+from biresnerf.refinement.finish.work_ahead import WorkAhead
 from biresnerf.refinement.lost.lost_cameras import LostCameraRepair
 from biresnerf.refinement.lost.own_matches import OwnMatches
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
@@ -27,6 +29,9 @@ from biresnerf.refinement.scene.scene_frame import scene_frame
 from biresnerf.refinement.stages.checkpoint import RunOrigin
 from biresnerf.refinement.stages.run_state import RunState
 from biresnerf.refinement.stages.two_stages import TwoStages
+from biresnerf.refinement.verdict.judgement import Judgement, judge_poses
+from biresnerf.refinement.verdict.run_report import Findings, run_report
+from biresnerf.report import Report
 
 CPU = torch.device("cpu")
 
@@ -130,6 +135,21 @@ class TinyRun:
     def parts(self) -> tuple[Scene, JointOptimiser, RunState]:
         """As most functions take them."""
         return self.scene, self.optimiser, self.state
+
+    @property
+    def ahead(self) -> WorkAhead:
+        return WorkAhead(*self.parts)
+
+    def judged(self, finish: Finish = Finish()) -> Judgement:
+        """What is found about its poses."""
+        made = self.optimiser
+        lost = int(made.camera_errors.lost.sum())
+        return judge_poses(self.scene, made.renderer, made.sampler, made.recipe, lost, self.state, finish)
+
+    def report(self, found: Findings | None = None) -> Report:
+        made, repaired = self.optimiser, self.repair.repaired
+        at, record = made.step_state(), self.state.record
+        return run_report(self.scene, made.renderer, made.recipe, at, record, repaired, found or Findings())
 
     @property
     def forecast(self) -> Forecast:

@@ -14,7 +14,8 @@ from biresnerf.refinement.finish.outcome import Finish
 from biresnerf.refinement.finish.photo_trial import photos_object
 from biresnerf.refinement.finish.work_ahead import adjustment
 from biresnerf.refinement.lost.lost_cameras import LostCameraRepair
-from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.optimise.methods import Recipe
+from biresnerf.refinement.optimise.renderer import Renderer
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.run_state import RunState
 from biresnerf.refinement.start.first_step import adjusts_cameras
@@ -24,9 +25,15 @@ logger = logging.getLogger(__name__)
 
 
 def adjust_cameras(
-    scene: Scene, optimiser: JointOptimiser, run: RunState, repair: LostCameraRepair, *, moves: bool = True
+    scene: Scene,
+    renderer: Renderer,
+    recipe: Recipe,
+    run: RunState,
+    repair: LostCameraRepair,
+    *,
+    moves: bool = True,
 ) -> Finish:
-    """Adjust all cameras at once, and where left-out evidence says that is better move them and hold them there.
+    """Adjust all cameras at once, and move them where left-out evidence says that is better; they are to stay there.
 
     Cameras that their own matches contradict are placed by those first. Photos have the last word: nothing is moved
     where they object, by fields that are trained on them unless patches of them speak for it. Methods of others are
@@ -38,9 +45,10 @@ def adjust_cameras(
     Raises:
         Interrupted: stopped; a continued run adjusts again.
     """
-    if not adjusts_cameras(scene.dataset, optimiser.method):
+    if not adjusts_cameras(scene.dataset, recipe.method):
         return Finish()
-    certainty = optimiser.lenses.certainty
+    joint, of_lenses = renderer.joint, renderer.joint.lenses
+    certainty = of_lenses.certainty
 
     def announce() -> None:
         run.monitor.raise_if_stopped("stopped while the cameras were adjusted; run again to go on")
@@ -49,30 +57,28 @@ def adjust_cameras(
     with run.timed("adjusting", amount=adjustment(scene)):
         if moves:
             repair.place_by_matches()
-        placed = ~optimiser.camera_errors.doubted.cpu().numpy()
-        numbers = optimiser.method.evidence
-        gathered = gather_evidence(scene, optimiser.renderer, optimiser.options, placed, numbers)
-        found = choose_poses(scene, optimiser.joint, gathered, optimiser.options, announce)
+        placed, numbers = repair.camera_errors.placed, recipe.method.evidence
+        gathered = gather_evidence(scene, renderer, recipe.options, placed, numbers)
+        found = choose_poses(scene, joint, gathered, recipe.options, announce)
     if found is None:
         return Finish()
     chosen, finish, focals = found
-    optimiser.lenses.be_certain(focals)
+    of_lenses.be_certain(focals)
     if not moves:
         return finish
     if finish.heeds_photos:
         run.monitor.forecast.expect({"adjusting": 0.0})  # unless photos object
-    cameras, lenses = optimiser.lenses.refined(scene.dataset).cameras, chosen.lenses
+    cameras, lenses = of_lenses.refined(scene.dataset).cameras, chosen.lenses
     if lenses is not None:
         cameras = corrected_cameras(cameras, lenses.correction) or cameras
     asked = chosen.name not in ("refined", *BY_PATCHES)
     rig = Rig(chosen.world_from_cam, tuple(cameras[frame.camera] for frame in scene.dataset.frames))
-    if asked and photos_object(scene, optimiser.joint, optimiser.recipe, run, rig):
+    if asked and photos_object(scene, joint, recipe, run, rig):
         logger.info("the photos contradict these poses, which are not taken")
-        optimiser.lenses.be_certain(certainty)
+        of_lenses.be_certain(certainty)
         return finish.refused()
     if chosen.name != "refined":
-        optimiser.poses.place(torch.from_numpy(chosen.world_from_cam))
-        optimiser.hold_poses()
+        joint.poses.place(torch.from_numpy(chosen.world_from_cam))
     if lenses is not None:
-        optimiser.lenses.place(scene.dataset.cameras, cameras)
+        of_lenses.place(scene.dataset.cameras, cameras)
     return finish

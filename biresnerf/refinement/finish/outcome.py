@@ -54,6 +54,11 @@ class Finish:
         return any(each.chosen and each.name == "refined" for each in self.candidates)
 
     @property
+    def moved(self) -> bool:
+        """Whether other poses than those that were are better."""
+        return any(each.chosen and each.name != "refined" for each in self.candidates)
+
+    @property
     def heeds_photos(self) -> bool:
         """Whether patches of the photos were to be trusted."""
         return self.fit is not None and self.fit.evidence.patches is not None

@@ -32,12 +32,12 @@ def run_rounds(stages: TwoStages, scene: Scene) -> Finish:
     first: Finish | None = None
     if not run.record.adjusted:
         stages.run_stage_2(FIRST_ROUND)
-        first = adjust_cameras(scene, optimiser, run, repair)
-        if optimiser.poses_held:
+        first = adjust_cameras(scene, optimiser.renderer, optimiser.recipe, run, repair)
+        if first.moved:
+            optimiser.hold_poses()
             stages.begin_block()
             optimiser.end_after(LEARNING)
-        over = optimiser.poses_held and first.heeds_photos
-        again = not over and _time_to_adjust_again(run, slack_s)
+        again = not (first.moved and first.heeds_photos) and _time_to_adjust_again(run, slack_s)
         run.note(
             adjusted=True, candidates=first.candidates, believed=first.fit is not None, adjusts_again=again
         )
@@ -49,7 +49,9 @@ def run_rounds(stages: TwoStages, scene: Scene) -> Finish:
         return first
     if not again and not then.believed:
         return Finish(then.candidates)
-    last = adjust_cameras(scene, optimiser, run, repair, moves=again)
+    last = adjust_cameras(scene, optimiser.renderer, optimiser.recipe, run, repair, moves=again)
+    if again and last.moved:
+        optimiser.hold_poses()
     # The poses that are held are what the first adjustment made of the field's.
     chosen_then = not again or (held and last.kept)
     return replace(last, candidates=then.candidates) if chosen_then else last

@@ -46,76 +46,98 @@ def expect_run(forecast: Forecast, dataset: Dataset, recipe: Recipe) -> None:
     forecast.expect(work.amounts)
 
 
-def expect_rest(scene: Scene, optimiser: JointOptimiser, run: RunState) -> None:
-    """All of a run from where its steps begin or go on."""
-    forecast = run.monitor.forecast
-    forecast.leave()
-    forecast.continues(sum(run.record.seconds.values()))
-    adjusts = adjusts_cameras(scene.dataset, optimiser.method)
-    share = steps_share(matched=scene.tracks is not None and adjusts)
-    forecast.plan(step_weights(optimiser.options, kind=optimiser.schedule.kind), share)
-    forecast.expect(work_ahead(scene, optimiser, run), alone=True)
+class WorkAhead:
+    """What is left of a run from its first step on, and how many steps there is time for."""
 
+    def __init__(self, scene: Scene, optimiser: JointOptimiser, run: RunState) -> None:
+        self._scene, self._optimiser, self._run = scene, optimiser, run
+        self._adjusts = adjusts_cameras(scene.dataset, optimiser.method)
 
-def expect_as_measured(scene: Scene, optimiser: JointOptimiser, run: RunState) -> None:
-    """The rest of a run on its way, as its poses and what it has done tell it now."""
-    run.monitor.forecast.expect(work_ahead(scene, optimiser, run))
+    def expect_all(self) -> None:
+        """Tell the forecast all of the run from where its steps begin or go on."""
+        optimiser, forecast = self._optimiser, self._run.monitor.forecast
+        forecast.leave()
+        forecast.continues(sum(self._run.record.seconds.values()))
+        share = steps_share(matched=self._scene.tracks is not None and self._adjusts)
+        forecast.plan(step_weights(optimiser.options, kind=optimiser.schedule.kind), share)
+        forecast.expect(self.left(), alone=True)
 
+    def expect(self) -> None:
+        """Tell it the rest of a run on its way, as its poses and what it has done tell it now."""
+        self._run.monitor.forecast.expect(self.left())
 
-def work_ahead(
-    scene: Scene,
-    optimiser: JointOptimiser,
-    run: RunState,
-    options: ResolvedOptions | None = None,
-    *,
-    checks: bool | None = None,
-) -> dict[Phase, float]:
-    """What is left of a run after its first step, with other options (of its steps) if given.
+    def left(
+        self, options: ResolvedOptions | None = None, *, checks: bool | None = None
+    ) -> dict[Phase, float]:
+        """What is left after the first step, with other options (of its steps) if given.
 
-    Args:
-        checks: what `checks_ahead` says, where it was asked already.
-    """
-    kind = optimiser.schedule.kind
-    options = options or optimiser.schedule.options
-    step, switch = optimiser.step_index, optimiser.switch
-    coarse, fine = run.steps_left(step, switch, options.steps, options.coarse_steps_max)
-    weights = step_weights(options, kind=kind)
-    adjusts, first = adjusts_cameras(scene.dataset, optimiser.method), not run.record.adjusted
-    each = adjustment(scene) if adjusts else 0.0
-    checks = checks_ahead(scene, optimiser, run) if checks is None else checks
-    return {
-        "coarse": coarse * weights["coarse"],
-        "fine": fine * weights["fine"],
-        **after_steps(options, kind, adjusting=(first + run.record.adjusts_again) * each, checks=checks),
-    }
+        Args:
+            checks: what `checks` says, where it was asked already.
+        """
+        schedule, step, switch = self._optimiser.schedule, self._optimiser.step_index, self._optimiser.switch
+        options = options or schedule.options
+        coarse, fine = self._run.steps_left(step, switch, options.steps, options.coarse_steps_max)
+        weights = step_weights(options, kind=schedule.kind)
+        first, again = not self._run.record.adjusted, self._run.record.adjusts_again
+        each = adjustment(self._scene) if self._adjusts else 0.0
+        checks = self.checks() if checks is None else checks
+        return {
+            "coarse": coarse * weights["coarse"],
+            "fine": fine * weights["fine"],
+            **after_steps(options, schedule.kind, adjusting=(first + again) * each, checks=checks),
+        }
 
+    def checks(self) -> bool:
+        """Whether photos will judge the adjusted cameras."""
+        if not self._adjusts or self._run.record.adjusted or self._scene.tracks is None:
+            return False
+        optimiser = self._optimiser
+        present, unseen_px = optimiser.joint.unit_from_cam, optimiser.method.finish.unseen_px
+        return photos_will_be_asked(self._scene, present, unseen_px)
 
-def checks_ahead(scene: Scene, optimiser: JointOptimiser, run: RunState) -> bool:
-    """Whether photos will judge the adjusted cameras."""
-    adjusts = adjusts_cameras(scene.dataset, optimiser.method) and not run.record.adjusted
-    if not adjusts or scene.tracks is None:
-        return False
-    return photos_will_be_asked(scene, optimiser.joint.unit_from_cam, optimiser.method.finish.unseen_px)
+    def keep_to_budget(self, started: float, steps_asked: int) -> None:
+        """Let a run that started at this `time.monotonic` end within its budget; predict its end if it has none.
+
+        What it took before it was interrupted counts.
+        """
+        seconds, run = self._optimiser.options.time_budget_s, self._run
+        if not seconds:
+            run.keep_to(self.expect)
+            return
+        writing = self._optimiser.method.finish.writing
+        ends = started + (1 - writing) * seconds - sum(run.record.seconds.values())
+        run.keep_to(partial(self.choose_steps, steps_asked), ends)
+
+    def choose_steps(self, most: int) -> None:
+        """Leave the run as many steps as there is time for, `most` in all; fewer where poses stand still now."""
+        optimiser = self._optimiser
+        before = optimiser.schedule.steps
+        high = max(FEWEST_STEPS, round((FIRST_ROUND + LEARNING) * most)) if optimiser.poses_held else most
+        low = min(
+            high, max(optimiser.step_index, round(optimiser.method.finish.least_steps * most), FEWEST_STEPS)
+        )
+        left_s, checks = self._run.left_s, self.checks()
+
+        def needed_s(steps: int) -> float:
+            options = optimiser.options.with_steps(steps) if optimiser.switch is None else optimiser.options
+            options = options.model_copy(update={"steps": steps})
+            return self._run.monitor.forecast.left_s(self.left(options, checks=checks))
+
+        while low < high:
+            steps = (low + high + 1) // 2
+            if needed_s(steps) <= left_s:
+                low = steps
+            else:
+                high = steps - 1
+        if low != before:
+            logger.debug("%d steps in place of %d: %.0f s left", low, before, left_s)
+            optimiser.set_steps(low)
+        self.expect()
 
 
 def adjustment(scene: Scene) -> float:
     """Work of one adjustment of all cameras."""
     return adjustment_work(len(scene.dataset), 0 if scene.tracks is None else len(scene.tracks.point))
-
-
-def keep_to_budget(
-    scene: Scene, optimiser: JointOptimiser, run: RunState, started: float, steps_asked: int
-) -> None:
-    """Let a run that started at this `time.monotonic` end within its budget; predict its end if it has none.
-
-    What it took before it was interrupted counts.
-    """
-    seconds = optimiser.options.time_budget_s
-    if not seconds:
-        run.keep_to(partial(expect_as_measured, scene, optimiser, run))
-        return
-    ends = started + (1 - optimiser.method.finish.writing) * seconds - sum(run.record.seconds.values())
-    run.keep_to(partial(choose_steps, scene, optimiser, run, steps_asked), ends)
 
 
 def budget_warnings(budget_s: float, spent: Mapping[str, float]) -> tuple[str, ...]:
@@ -127,29 +149,3 @@ def budget_warnings(budget_s: float, spent: Mapping[str, float]) -> tuple[str, .
         f"The run took {total:.0f} s of a budget of {budget_s:g} s, {spent.get('preparing', 0.0):.0f} s of them "
         "before the first step. Give it more time, or fewer or smaller photos.",
     )
-
-
-def choose_steps(scene: Scene, optimiser: JointOptimiser, run: RunState, most: int) -> None:
-    """Leave a run as many steps as there is time for, `most` in all; fewer where poses stand still from now on."""
-    before = optimiser.schedule.steps
-    high = max(FEWEST_STEPS, round((FIRST_ROUND + LEARNING) * most)) if optimiser.poses_held else most
-    low = min(
-        high, max(optimiser.step_index, round(optimiser.method.finish.least_steps * most), FEWEST_STEPS)
-    )
-    left_s, checks = run.left_s, checks_ahead(scene, optimiser, run)
-
-    def needed_s(steps: int) -> float:
-        options = optimiser.options.with_steps(steps) if optimiser.switch is None else optimiser.options
-        options = options.model_copy(update={"steps": steps})
-        return run.monitor.forecast.left_s(work_ahead(scene, optimiser, run, options, checks=checks))
-
-    while low < high:
-        steps = (low + high + 1) // 2
-        if needed_s(steps) <= left_s:
-            low = steps
-        else:
-            high = steps - 1
-    if low != before:
-        logger.debug("%d steps in place of %d: %.0f s left", low, before, left_s)
-        optimiser.set_steps(low)
-    expect_as_measured(scene, optimiser, run)

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from biresnerf.field.radiance_field import Marching, PositionGradient, Rays, Rendering
+from biresnerf.field.radiance_field import Marching, PositionGradient, Rendering
 from biresnerf.frozen_model import FrozenModel
 from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.judging.compare import ANY_GAIN, FAR_REPAIRED, REPAIRED, is_better, octaves
@@ -32,45 +32,6 @@ ALONE_SIDE = 8  # a view shares what 8 x 8 pixels of it show
 NO_ERROR = 1e-12
 
 
-class MatchedRepair:
-    """What the matches of single cameras say to their repair; nothing where there are none.
-
-    Args:
-        own: the photos' feature matches.
-    """
-
-    def __init__(self, optimiser: JointOptimiser, own: OwnMatches | None) -> None:
-        self.optimiser, self._own = optimiser, own
-
-    def place(self) -> list[int]:
-        """Give cameras that their own matches contradict a pose that those support, the worst first; returns which."""
-        if self._own is None:
-            return []
-        optimiser, placed = self.optimiser, []
-        errors = self._own.errors_px(optimiser.poses.poses().numpy())
-        wrong = contradicted(errors, optimiser.method.lost) & optimiser.bodies.alone
-        trusted = ~(wrong | optimiser.camera_errors.suspects.cpu().numpy())
-        for camera in np.argsort(-np.nan_to_num(errors) * wrong)[: int(wrong.sum())].tolist():
-            found = self._own.placed(camera, optimiser.poses.poses().numpy(), trusted, optimiser.method.lost)
-            logger.info(
-                "the matches of camera %d are off by %.3g px and %s",
-                camera, errors[camera], "place it elsewhere" if found is not None else "do not place it",
-            )  # fmt: skip
-            if found is not None:
-                optimiser.replace_pose(camera, torch.from_numpy(found[:3]).float().to(optimiser.device))
-                placed.append(camera)
-        return placed
-
-    def object_to(self, camera: int, unit_from_cam: Tensor) -> bool:
-        """Whether a camera's own matches fit another pose [3, 4] less well than its present one."""
-        if self._own is None:
-            return False
-        now = self.optimiser.poses.poses().numpy()
-        moved = now.copy()
-        moved[camera, :3] = unit_from_cam.double().cpu().numpy()
-        return better(camera, self._own.errors_px(moved), self._own.errors_px(now))
-
-
 class RepairState(FrozenModel):
     """What a checkpoint keeps: images repaired, fixed points passed, samples spent."""
 
@@ -82,12 +43,15 @@ class RepairState(FrozenModel):
 class LostCameraRepair:
     """Looks for lost cameras at fixed points of the run and gives them other poses.
 
+    Args:
+        own: the photos' feature matches, where there are any.
+
     Attributes:
         repaired: images whose pose was replaced.
     """
 
     def __init__(self, optimiser: JointOptimiser, own: OwnMatches | None = None) -> None:
-        self.optimiser, self._matches = optimiser, MatchedRepair(optimiser, own)
+        self.optimiser, self._own, self.camera_errors = optimiser, own, optimiser.camera_errors
         self._numbers = optimiser.method.lost
         self.repaired: list[int] = []
         self._marching = optimiser.marching(optimiser.schedule.fine_interval)
@@ -115,15 +79,15 @@ class LostCameraRepair:
             return
         self._times = 3 if switching else self._times + 1 if optimiser.switch is None else 4
         total = float(optimiser.schedule.samples(optimiser.schedule.steps, 0)) * optimiser.schedule.steps
-        total *= self._numbers.guessed_times if bool(optimiser.camera_errors.doubted.any()) else 1
+        total *= self._numbers.guessed_times if bool(self.camera_errors.doubted.any()) else 1
         allowance = min(self._spent + self._numbers.event_share * total, self._numbers.run_share * total)
         self._marching = self._coarse_marching()
         self.place_by_matches()
         alone = self._alone()
         # Matches are better evidence than the error of a young field: cameras they placed stay (on dtu these were 2 deg
         # off, and 7 to 9 deg after a repair).
-        suspects = (optimiser.camera_errors.suspects | alone) & (optimiser.mobility[0] > 0)
-        relative = torch.where(suspects, optimiser.camera_errors.relative, -torch.inf)
+        suspects = (self.camera_errors.suspects | alone) & (optimiser.mobility[0] > 0)
+        relative = torch.where(suspects, self.camera_errors.relative, -torch.inf)
         worst_first = relative.argsort(descending=True, stable=True)[: int(suspects.sum())].tolist()
         median = self._reference_error(suspects) if worst_first else 0.0
         for camera in worst_first:
@@ -133,8 +97,34 @@ class LostCameraRepair:
             self._repair(camera, median, ~suspects, alone=bool(alone[camera]))
 
     def place_by_matches(self) -> None:
-        """Give cameras that their own matches contradict the poses that those support."""
-        self.repaired = sorted({*self.repaired, *self._matches.place()})
+        """Give cameras that their own matches contradict poses that those support, the worst first."""
+        if self._own is None:
+            return
+        optimiser, numbers = self.optimiser, self._numbers
+        errors = self._own.errors_px(optimiser.poses.poses().numpy())
+        wrong = contradicted(errors, numbers) & optimiser.bodies.alone
+        trusted = ~(wrong | self.camera_errors.suspects.cpu().numpy())
+        for camera in np.argsort(-np.nan_to_num(errors) * wrong)[: int(wrong.sum())].tolist():
+            found = self._own.placed(camera, optimiser.poses.poses().numpy(), trusted, numbers)
+            logger.info(
+                "the matches of camera %d are off by %.3g px and %s",
+                camera, errors[camera], "place it elsewhere" if found is not None else "do not place it",
+            )  # fmt: skip
+            if found is not None:
+                self._replace(camera, torch.from_numpy(found[:3]).float().to(optimiser.device))
+
+    def matches_object_to(self, camera: int, unit_from_cam: Tensor) -> bool:
+        """Whether a camera's own matches fit another pose [3, 4] less well than its present one."""
+        if self._own is None:
+            return False
+        now = self.optimiser.poses.poses().numpy()
+        moved = now.copy()
+        moved[camera, :3] = unit_from_cam.double().cpu().numpy()
+        return better(camera, self._own.errors_px(moved), self._own.errors_px(now))
+
+    def _replace(self, camera: int, unit_from_cam: Tensor) -> None:
+        self.optimiser.replace_pose(camera, unit_from_cam)
+        self.repaired = sorted({*self.repaired, camera})
 
     @torch.no_grad()
     def _alone(self) -> Tensor:
@@ -146,7 +136,7 @@ class LostCameraRepair:
             return alone
         cameras = torch.arange(len(alone), device=optimiser.device)
         unshared = self._shared(optimiser.poses.matrices(), cameras) < least
-        unshared &= ~optimiser.camera_errors.held_out
+        unshared &= ~self.camera_errors.held_out
         return unshared if float(unshared.float().mean()) <= self._numbers.alone_most else alone
 
     @torch.no_grad()
@@ -174,7 +164,7 @@ class LostCameraRepair:
     @torch.no_grad()
     def _reference_error(self, suspects: Tensor) -> float:
         """Median score of cameras that are not lost."""
-        trusted = torch.nonzero(~suspects & ~self.optimiser.camera_errors.held_out)[:, 0]
+        trusted = torch.nonzero(~suspects & ~self.camera_errors.held_out)[:, 0]
         if len(trusted) == 0:
             return 0.0
         count = min(self._numbers.references, len(trusted))
@@ -193,7 +183,7 @@ class LostCameraRepair:
         scores = self._scores(tried, image)
         old = float(scores[0])
         # A guess need not be clearly beaten.
-        rule = ANY_GAIN if bool(optimiser.camera_errors.doubted[camera]) else REPAIRED
+        rule = ANY_GAIN if bool(self.camera_errors.doubted[camera]) else REPAIRED
         if alone:  # its own error says nothing, nor does that of another pose that shares no view
             shared = self._shared(tried, image) >= optimiser.schedule.kind.alone
             if not bool(shared.any()):
@@ -209,7 +199,7 @@ class LostCameraRepair:
             accepted = near = error < self._numbers.near_median * median
             if not alone:
                 accepted = is_better(gain, rule) and (near or is_better(gain, FAR_REPAIRED))
-            accepted = accepted and not self._matches.object_to(camera, tried[best])
+            accepted = accepted and not self.matches_object_to(camera, tried[best])
             if accepted and (optimiser.switch is None or error < median):
                 break  # the run itself optimises the rest
         logger.info(
@@ -217,10 +207,9 @@ class LostCameraRepair:
             camera, old, median, error, "accepted" if accepted else "rejected",
         )  # fmt: skip
         if accepted:
-            optimiser.replace_pose(camera, tried[best])
-            self.repaired = sorted({*self.repaired, camera})
+            self._replace(camera, tried[best])
         elif old < self._numbers.near_median * median and not alone:
-            optimiser.camera_errors.believe(camera)  # nothing better was found than where it stands
+            self.camera_errors.believe(camera)  # nothing better was found than where it stands
 
     @torch.no_grad()
     def _scores(self, matrices: Tensor, image: Tensor) -> Tensor:
@@ -249,7 +238,7 @@ class LostCameraRepair:
         else:
             counting = counting.reshape(squared.shape)
             mean = (squared * counting).sum(1) / counting.sum(1).clamp(min=1)
-        return mean / optimiser.camera_errors.shares[image]
+        return mean / self.camera_errors.shares[image]
 
     def _optimised(self, matrices: Tensor, camera: int, rays: int, steps: int) -> Tensor:
         """Poses [k, 3, 4] after some steps of Adam on the photometric error alone, all in one batch."""
@@ -281,14 +270,9 @@ class LostCameraRepair:
     def _render(
         self, matrix: Tensor, image: Tensor, xy: Tensor, gradient: PositionGradient, *, jitter: bool = False
     ) -> Rendering:
-        optimiser = self.optimiser
-        origin, direction = optimiser.renderer.cast(matrix, image, xy)
-        start = torch.full((len(xy),), 0.5)
-        if jitter:
-            start = torch.rand(len(xy), generator=optimiser.generator)
-        background = optimiser.background.expand(len(xy), 3).contiguous()
-        rays = Rays(origin, direction, background, start.to(optimiser.device), 0)
-        return optimiser.field.render(rays, self._marching, gradient)
+        renderer = self.optimiser.renderer
+        rays = renderer.over_background(*renderer.cast(matrix, image, xy), 0, jitter=jitter)
+        return renderer.field.render(rays, self._marching, gradient)
 
     def _coarse_marching(self) -> Marching:
         """Coarser samples than the run's, and one more cell around occupied ones: gradients begin there."""

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from biresnerf.data.photos.images import ImageSet
@@ -111,6 +112,11 @@ class CameraErrors:
     @property
     def lost(self) -> Tensor:
         return (self._stood_out >= self._numbers.in_a_row) | self.doubted
+
+    @property
+    def placed(self) -> NDArray[np.bool_]:
+        """Mask [n] of cameras that do not stand at a guess still."""
+        return ~self.doubted.cpu().numpy()
 
     @property
     def suspects(self) -> Tensor:

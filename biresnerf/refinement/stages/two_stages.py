@@ -11,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 
+from biresnerf.arrays import Array
 from biresnerf.data.show.history import HistoryLine
 from biresnerf.errors import Interrupted, RefinementError
 from biresnerf.geometry.pose_error import rotation_between_deg
@@ -63,7 +64,7 @@ class TwoStages:
     """Runs a `JointOptimiser` to its last step; can stop after any step and continue from a checkpoint.
 
     Args:
-        at_check: what it returns at each check joins that check's line of the history.
+        at_check: what it returns of the poses at each check joins that check's line of the history.
         write_preview: shows the run in files, and returns these relative to the output folder.
     """
 
@@ -72,7 +73,7 @@ class TwoStages:
         optimiser: JointOptimiser,
         repair: LostCameraRepair,
         run: RunState,
-        at_check: Callable[[JointOptimiser], dict[str, float]] = lambda _optimiser: {},
+        at_check: Callable[[Array], dict[str, float]] = lambda _unit_from_cam: {},
         write_preview: Callable[[], tuple[str, ...]] = lambda: (),
     ) -> None:
         self.optimiser, self.repair, self.run = optimiser, repair, run
@@ -215,7 +216,7 @@ class TwoStages:
                 field_rate=rates.pose,
                 reconstruction_rate=max(rates.reconstruction, default=0.0),
                 seconds=round(sum(self.run.record.seconds[stage] for stage in ("coarse", "fine")), 3),
-                **{**self._signal, **self._at_check(optimiser)},
+                **{**self._signal, **self._at_check(self._poses_at_check.numpy())},
             ).model_dump(exclude_none=True)
         )
 

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from biresnerf.data.show.view_file import ShownView
 from biresnerf.geometry.similarity import Similarity
-from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.options.refine_options import ResolvedOptions
+from biresnerf.refinement.optimise.renderer import Renderer
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.run_state import RunState
-from biresnerf.refinement.views.evaluation import ViewScore, fit_held_out_poses, render_orbit, score_views
+from biresnerf.refinement.views.evaluation import ViewScore, render_orbit, score_views
 from biresnerf.refinement.views.shown_views import Points, spread_views, surface_of
 
 logger = logging.getLogger(__name__)
@@ -55,37 +56,36 @@ class Evaluation:
         return input_from_optimised.apply(unit_from_world.inverse().apply(positions)), colours
 
 
-def evaluate(scene: Scene, optimiser: JointOptimiser, run: RunState, pictures: Pictures) -> Evaluation:
-    """Fit the poses of held-out views that no evidence placed, score and render views, film the orbit.
+def evaluate(
+    scene: Scene, renderer: Renderer, options: ResolvedOptions, run: RunState, pictures: Pictures
+) -> Evaluation:
+    """Score and render views, film the orbit.
 
     Raises:
         Interrupted: stopped; a continued run evaluates again.
     """
-    with run.timed("evaluating"):
-        run.report_evaluation(0.0)
-        fit_held_out_poses(optimiser, scene.excluded_from_training)
-        first = scene.held_out or list(range(min(SHOWN_WITHOUT_HELD_OUT, len(scene.dataset))))
-        frames, more = optimiser.options.orbit_frames, optimiser.options.shown_views
-        further = spread_views(scene.dataset.world_from_cam, first, more)
-        work = len(first) + len(further) + frames
+    first = scene.held_out or list(range(min(SHOWN_WITHOUT_HELD_OUT, len(scene.dataset))))
+    frames, more = options.orbit_frames, options.shown_views
+    further = spread_views(scene.dataset.world_from_cam, first, more)
+    work = len(first) + len(further) + frames
 
-        def report(done: int) -> None:
-            run.monitor.raise_if_stopped("stopped while the result was measured; run again to go on")
-            run.report_evaluation(done / max(1, work), done, work)
+    def report(done: int) -> None:
+        run.monitor.raise_if_stopped("stopped while the result was measured; run again to go on")
+        run.report_evaluation(done / max(1, work), done, work)
 
-        report(0)
-        evaluation, renderer = Evaluation(), optimiser.renderer
-        shown = chain(first, _while_cheap(further, sum(run.record.seconds.values())))
-        for score in score_views(renderer, scene.images, shown):
-            evaluation.views.append(pictures.write_view(score))
-            evaluation.surfaces.append(surface_of(renderer, score))
-            if score.image in scene.held_out:
-                evaluation.scores.append(score)
-            report(len(evaluation.views))
-        if frames:
-            views = len(first) + len(further)
-            pictures.write_orbit(render_orbit(renderer, frames, lambda i: report(views + i + 1)))
-        return evaluation
+    report(0)
+    evaluation = Evaluation()
+    shown = chain(first, _while_cheap(further, sum(run.record.seconds.values())))
+    for score in score_views(renderer, scene.images, shown):
+        evaluation.views.append(pictures.write_view(score))
+        evaluation.surfaces.append(surface_of(renderer, score))
+        if score.image in scene.held_out:
+            evaluation.scores.append(score)
+        report(len(evaluation.views))
+    if frames:
+        views = len(first) + len(further)
+        pictures.write_orbit(render_orbit(renderer, frames, lambda i: report(views + i + 1)))
+    return evaluation
 
 
 def _while_cheap(views: list[int], spent_before_s: float) -> Iterator[int]:

@@ -48,10 +48,10 @@ def _four_neighbours(values: Array) -> Array:
 
 
 @torch.no_grad()
-def gains(renderer: Renderer, sampler: PhotoSampler, draws: torch.Generator) -> Array:
+def gains(renderer: Renderer, sampler: PhotoSampler) -> Array:
     """Brightness of each photo over that of its render [n], from random pixels that show the scene; NaN if none do."""
     count = len(renderer.joint.poses)
-    batch = sampler.draw(GAIN_RAYS * count, 0.0, draws)
+    batch = sampler.draw(GAIN_RAYS * count, 0.0, renderer.draws)
     shown, rendered = np.zeros(count), np.zeros(count)
     matrices = renderer.joint.poses.matrices().detach()
     for part in torch.arange(len(batch.image), device=renderer.device).split(GAIN_RAYS * 32):

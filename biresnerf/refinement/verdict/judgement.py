@@ -22,8 +22,9 @@ from biresnerf.refinement.finish.gather_evidence import measured_evidence
 from biresnerf.refinement.finish.outcome import Finish
 from biresnerf.refinement.lost.own_matches import contradicted
 from biresnerf.refinement.numbers.finish import EvidenceNumbers
-from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
-from biresnerf.refinement.optimise.methods import Method
+from biresnerf.refinement.optimise.methods import Method, Recipe
+from biresnerf.refinement.optimise.photo_sampler import PhotoSampler
+from biresnerf.refinement.optimise.renderer import Renderer
 from biresnerf.refinement.parameters.joint_parameters import JointParameters
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.run_state import RunState
@@ -81,23 +82,6 @@ class Judgement:
     errors: ExpectedErrors | None = None
 
 
-def judge(scene: Scene, optimiser: JointOptimiser, run: RunState, finish: Finish) -> Judgement | None:
-    """The verdict on the refined poses; None where the options ask for none.
-
-    Args:
-        finish: with the poses that fit all evidence that is to be trusted.
-
-    Raises:
-        Interrupted: stopped; a continued run judges again.
-    """
-    if not optimiser.options.verdict:
-        return None
-    with run.timed("judging"):
-        judgement = judge_poses(scene, optimiser, run, finish)
-    logger.info("verdict: %s", judgement.verdict.verdict)
-    return judgement
-
-
 def _rounds(run: RunState, times: int, most: int) -> int:
     """How many rounds of trainings of `times` the usual length there is time for."""
     each_s = times * run.monitor.forecast.seconds("judging")
@@ -105,20 +89,33 @@ def _rounds(run: RunState, times: int, most: int) -> int:
 
 
 def judge_poses(
-    scene: Scene, optimiser: JointOptimiser, run: RunState, finish: Finish = Finish()
+    scene: Scene,
+    renderer: Renderer,
+    sampler: PhotoSampler,
+    recipe: Recipe,
+    lost: int,
+    run: RunState,
+    finish: Finish,
 ) -> Judgement:
-    """Compare the optimised poses with the dataset's own, as `judge` does.
+    """The verdict on the optimised poses, compared with the dataset's own.
 
     Fields are trained in as many rounds as there is time for, and in one of the usual length in any case.
+
+    Args:
+        lost: how many cameras agree with no pose found.
+        finish: with the poses that fit all evidence that is to be trusted.
+
+    Raises:
+        Interrupted: stopped; a continued run judges again.
     """
     report = partial(run.report_evaluation, message="comparing the refined poses with the input's")
     report(0.0)
-    joint, numbers, most = optimiser.joint, optimiser.method.verdict, optimiser.method.views.rounds_most
+    joint, method = renderer.joint, recipe.method
+    numbers, most = method.verdict, method.views.rounds_most
     refined = RefinedPoses.now(scene.dataset, joint)
-    lost = int(optimiser.camera_errors.lost.sum())
-    found = compare_without_training(scene, refined, lost, optimiser.method)
+    found = compare_without_training(scene, refined, lost, method)
     # Only then it matters what the evidence determines: to know it, a matrix of all cameras is inverted.
-    asked = matches_are_better(found.findings) and optimiser.method.uncertainty
+    asked = matches_are_better(found.findings) and method.uncertainty
     errors = _errors(refined, joint, finish) if asked else None
     told = replace(found.findings, determined=_determined(errors, finish))
     heldout: HeldOutComparison | None = None
@@ -128,7 +125,7 @@ def judge_poses(
         rounds = max(_rounds(run, 1, most), 1)
         for each in (effort, replace(effort, times=numbers.longer, looks=(1.0,))):
             heldout = compare_placed(
-                found.before, found.after, scene, optimiser.recipe, found.placed | (not told.grounded),
+                found.before, found.after, scene, recipe, found.placed | (not told.grounded),
                 run.monitor.should_stop, report, replace(each, rounds_most=rounds),
             )  # fmt: skip
             work += heldout.work if heldout else 0.0
@@ -139,8 +136,9 @@ def judge_poses(
                 break
     run.monitor.forecast.took(JUDGING + work)
     verdict = decide(replace(told, heldout=heldout.evidence if heldout else None))
-    gain = image_flags.gains(optimiser.renderer, optimiser.sampler, optimiser.generator)
-    return replace(_with_images(verdict, scene, gain, found, heldout, optimiser.method), errors=errors)
+    logger.info("verdict: %s", verdict.verdict)
+    gain = image_flags.gains(renderer, sampler)
+    return replace(_with_images(verdict, scene, gain, found, heldout, method), errors=errors)
 
 
 def _determined(errors: ExpectedErrors | None, finish: Finish) -> float | None:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.photo_folders import few_names
@@ -20,8 +19,9 @@ from biresnerf.refinement.finish.outcome import Finish
 from biresnerf.refinement.finish.work_ahead import budget_warnings
 from biresnerf.refinement.lost.own_matches import LEAST_PAIRS
 from biresnerf.refinement.optimise.device_memory import smaller_batches
-from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.method_changes import method_warnings
+from biresnerf.refinement.optimise.methods import Recipe
+from biresnerf.refinement.optimise.optimiser_state import StepState
 from biresnerf.refinement.optimise.renderer import Renderer
 from biresnerf.refinement.parameters.intrinsics_parameters import FocalCertainty, IntrinsicsParameters
 from biresnerf.refinement.parameters.joint_parameters import JointParameters
@@ -59,51 +59,55 @@ class Findings:
 
 def run_report(
     scene: Scene,
-    optimiser: JointOptimiser,
+    renderer: Renderer,
+    recipe: Recipe,
+    at: StepState,
     record: RunRecord,
     repaired: Collection[int],
     found: Findings = Findings(),
 ) -> Report:
-    """The report of a run as it is now; ``repaired`` are the images whose pose was replaced."""
+    """The report of a run as it is ``at`` a step; ``repaired`` are the images whose pose was replaced."""
     from biresnerf import __version__
 
     finish, judgement, so_far = found.finish, found.judgement, found.so_far
-    joint, untrained = optimiser.joint, optimiser.camera_errors.held_out
-    dataset, given = scene.dataset, finish.given if finish is not None else None
+    joint, options, dataset = renderer.joint, recipe.options, scene.dataset
+    given = finish.given if finish is not None else None
     refined = so_far.refined if so_far is not None else RefinedPoses.now(dataset, joint)
     return Report(
         version=__version__,
         state="partial" if finish is None else "complete",
-        options=optimiser.options,
+        options=options,
         verdict=judgement.verdict if judgement is not None else None,
         verdict_so_far=so_far.verdict if so_far is not None else None,
         images=_image_reports(scene, joint, repaired, refined.world_from_cam, found),
         cameras=camera_reports(dataset, refined.lenses),
-        heldout=held_out_report(optimiser.renderer, untrained, found.scores) if found.scores else None,
+        heldout=held_out_report(renderer, scene.excluded_from_training, found.scores)
+        if found.scores
+        else None,
         start_trials=scene.start.trials,
         candidates=finish.candidates if finish is not None else (),
         input_accuracy=given and accuracy_report(given),
-        steps_done=optimiser.step_index,
-        switch_step=optimiser.switch if optimiser.method.two_stages else None,
+        steps_done=at.step_index,
+        switch_step=at.switch if recipe.method.two_stages else None,
         switch_reason=record.switch_reason,
         resumed=record.resumed,
         seconds={stage: round(seconds, 3) for stage, seconds in record.seconds.items()},
-        backend=optimiser.field.backend,
-        device=str(optimiser.device),
-        threads=optimiser.threads,
+        backend=renderer.field.backend,
+        device=str(recipe.device),
+        threads=recipe.threads,
         working_size=(int(scene.images.widths.max()), int(scene.images.heights.max())),
         input_from_optimised=refined.input_from_optimised.report(),
         faults=dataset.faults,
         warnings=dataset.warnings
         + focal_warnings(dataset, refined.lenses)
         + turntable_warnings(scene.start)
-        + accuracy_warnings(given, optimiser.options)
+        + accuracy_warnings(given, options)
         + unmatched_warnings(scene)
-        + one_place_warnings(scene.tracks, refined, optimiser.method.verdict.one_place)
-        + method_warnings(optimiser.recipe)
-        + gpu_warnings(optimiser.device)
-        + smaller_batches(optimiser.batch_share, optimiser.options.samples_per_step)
-        + budget_warnings(optimiser.options.time_budget_s, record.seconds)
+        + one_place_warnings(scene.tracks, refined, recipe.method.verdict.one_place)
+        + method_warnings(recipe)
+        + gpu_warnings(recipe.device)
+        + smaller_batches(at.batch_share, options.samples_per_step)
+        + budget_warnings(options.time_budget_s, record.seconds)
         + _unknown_warnings(dataset, found.uncertainty),
     )
 
@@ -149,9 +153,11 @@ def focal_warnings(dataset: Dataset, lenses: IntrinsicsParameters) -> tuple[str,
     return tuple(found)
 
 
-def held_out_report(renderer: Renderer, held_out: Tensor, scores: Sequence[ViewScore]) -> HeldOut:
-    """Means over the held-out views, bool [n], at their present poses."""
+def held_out_report(renderer: Renderer, untrained: list[int], scores: Sequence[ViewScore]) -> HeldOut:
+    """Means over the held-out views at their present poses, of a field that some views did not train."""
     matrices = renderer.joint.poses.matrices().detach()
+    held_out = torch.zeros(len(matrices), dtype=torch.bool, device=renderer.device)
+    held_out[untrained] = True
     return HeldOut(
         count=len(scores),
         psnr=float(np.mean([s.psnr for s in scores])),

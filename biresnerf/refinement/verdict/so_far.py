@@ -12,7 +12,9 @@ from biresnerf.data.model.dataset import Dataset
 from biresnerf.judging.compare import LATER_MATCH_ERRORS, compare
 from biresnerf.refinement.finish.expected_errors import expected_errors
 from biresnerf.refinement.finish.gather_evidence import without_patches
-from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
+from biresnerf.refinement.optimise.camera_errors import CameraErrors
+from biresnerf.refinement.optimise.methods import Recipe
+from biresnerf.refinement.parameters.joint_parameters import JointParameters
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.checkpoint import BestSoFar
 from biresnerf.refinement.stages.run_state import RunState
@@ -45,18 +47,19 @@ class SoFar:
         return self.refined.world_from_cam, self.refined.dataset
 
 
-def poses_so_far(scene: Scene, optimiser: JointOptimiser, run: RunState) -> SoFar:
+def poses_so_far(
+    scene: Scene, joint: JointParameters, camera_errors: CameraErrors, recipe: Recipe, run: RunState
+) -> SoFar:
     """Measure the present poses, keep them if they are the best, and return the best.
 
     The input's poses are the first candidate, and poses follow them that the verdict's rule returns. Later ones take
     their place unless matches say that they are worse than the best ever measured, by as much as matters. No field is
     trained for it: it takes as long as a few steps.
     """
-    joint = optimiser.joint
     best, now = run.record.best, RefinedPoses.now(scene.dataset, joint)
-    if not optimiser.options.verdict:
+    if not recipe.options.verdict:
         return SoFar(now, None)
-    verdict = _verdict(scene, optimiser, now)
+    verdict = _verdict(scene, joint, camera_errors, recipe, now)
     gain = 0.0 if verdict.epipolar is None else verdict.epipolar.error_px.difference
     worse = best is not None and compare(gain - best.gain, LATER_MATCH_ERRORS).finding == "worse"
     if verdict.returned == "refined" and not worse:
@@ -74,14 +77,15 @@ def poses_so_far(scene: Scene, optimiser: JointOptimiser, run: RunState) -> SoFa
     return SoFar(RefinedPoses.at(scene.dataset, joint, best.unit_from_cam, increments), best.verdict)
 
 
-def _verdict(scene: Scene, optimiser: JointOptimiser, refined: RefinedPoses) -> Verdict:
+def _verdict(
+    scene: Scene, joint: JointParameters, camera_errors: CameraErrors, recipe: Recipe, refined: RefinedPoses
+) -> Verdict:
     """By all but unseen views; where nothing else speaks for or against them, refined poses are offered."""
-    lost = int(optimiser.camera_errors.lost.sum())
-    findings = compare_without_training(scene, refined, lost, optimiser.method).findings
-    if matches_are_better(findings) and optimiser.method.uncertainty:
-        placed = ~optimiser.camera_errors.doubted.cpu().numpy()
-        of_lenses, joint = optimiser.options.refine_intrinsics, optimiser.joint
-        evidence = without_patches(scene, joint, of_lenses, placed, optimiser.method.evidence).fitted
+    lost, method = int(camera_errors.lost.sum()), recipe.method
+    findings = compare_without_training(scene, refined, lost, method).findings
+    if matches_are_better(findings) and method.uncertainty:
+        placed, of_lenses = camera_errors.placed, recipe.options.refine_intrinsics
+        evidence = without_patches(scene, joint, of_lenses, placed, method.evidence).fitted
         errors = expected_errors(joint.unit_from_cam, joint.unit_from_cam, evidence, bodies=joint.bodies)
         findings = replace(findings, determined=float(errors.known.mean()))
     verdict = decide(findings)

@@ -60,11 +60,11 @@ def fit_held_out_poses(optimiser: JointOptimiser, held_out: list[int]) -> None:
     mobility[torch.from_numpy(optimiser.bodies.fixed).to(optimiser.device)] = 0.0
     poses.restart_adam()
     exposure.restart_adam()
+    renderer = optimiser.renderer
 
     def seen(rays: int) -> tuple[PixelBatch, Rendering]:
         """Pixels drawn from the held-out photos, and what the field shows there from the present poses."""
-        renderer = optimiser.renderer
-        batch = optimiser.sampler.draw(rays, 0.0, optimiser.generator, held_out_only=True)
+        batch = optimiser.sampler.draw(rays, 0.0, renderer.draws, held_out_only=True)
         cast = renderer.cast(poses.matrices()[batch.image], batch.image, batch.xy)
         return batch, renderer.render(*cast, jitter=True)
 

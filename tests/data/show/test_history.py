@@ -20,7 +20,7 @@ def test_each_check_leaves_a_line_and_a_continued_run_has_them_once(tmp_path):
             given_scene(*scene),
             tmp_path,
             Monitor(should_stop=lambda: optimiser.step_index >= stop_at),
-            at_check=lambda now: {"observed": float(now.step_index)},
+            at_check=lambda _poses: {"observed": float(optimiser.step_index)},
         )
         checkpoint = load_checkpoint(tmp_path)
         if checkpoint is not None:

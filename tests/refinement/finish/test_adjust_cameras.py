@@ -67,7 +67,8 @@ def begun(
 
 
 def adjusted(run):
-    return adjust_cameras(*run.parts, run.repair)
+    made = run.optimiser
+    return adjust_cameras(run.scene, made.renderer, made.recipe, run.state, run.repair)
 
 
 def lenses(dataset):

@@ -8,13 +8,7 @@ import pytest
 from biresnerf.data.scene_kind import SceneKind
 from biresnerf.data.workload import FIRST_ROUND, LEARNING
 from biresnerf.forecast.run_forecast import RATES
-from biresnerf.refinement.finish.work_ahead import (
-    budget_warnings,
-    choose_steps,
-    keep_to_budget,
-    step_weights,
-    work_ahead,
-)
+from biresnerf.refinement.finish.work_ahead import budget_warnings, step_weights
 from biresnerf.refinement.optimise.methods import BIRESNERF
 from biresnerf.refinement.stages.checkpoint import load_checkpoint
 from biresnerf.refinement.stages.two_stages import MEASURED_STEPS
@@ -45,14 +39,14 @@ def with_step_of(run, seconds):
 
 
 def left_s(run):
-    return run.forecast.left_s(work_ahead(*run.parts))
+    return run.forecast.left_s(run.ahead.left())
 
 
 @pytest.mark.parametrize("seconds", [350.0, 450.0, 550.0])
 def test_as_many_steps_are_taken_as_there_is_time_for(scene, tmp_path, seconds):
     run = with_step_of(begun(scene, tmp_path), 1.0)
     run.end_in(seconds)
-    choose_steps(*run.parts, STEPS)
+    run.ahead.choose_steps(STEPS)
     assert BIRESNERF.finish.least_steps * STEPS < run.optimiser.schedule.steps < STEPS
     assert left_s(run) == pytest.approx(seconds, rel=0.02)
     options = run.optimiser.options
@@ -62,20 +56,20 @@ def test_as_many_steps_are_taken_as_there_is_time_for(scene, tmp_path, seconds):
 def test_no_more_steps_are_taken_than_were_asked_for_and_no_fewer_than_a_tenth(scene, tmp_path):
     run = with_step_of(begun(scene, tmp_path), 1.0)
     run.end_in(1e6)
-    choose_steps(*run.parts, STEPS)
+    run.ahead.choose_steps(STEPS)
     assert run.optimiser.schedule.steps == STEPS
     run.end_in(-1e6)
-    choose_steps(*run.parts, STEPS)
+    run.ahead.choose_steps(STEPS)
     assert run.optimiser.schedule.steps == round(BIRESNERF.finish.least_steps * STEPS)
 
 
 def test_steps_that_were_too_few_are_added_again_where_they_turn_out_faster(scene, tmp_path):
     run = with_step_of(begun(scene, tmp_path), 1.0)
     run.end_in(400)
-    choose_steps(*run.parts, STEPS)
+    run.ahead.choose_steps(STEPS)
     few = run.optimiser.schedule.steps
     run.optimiser.start_reconstruction()
-    choose_steps(*with_step_of(run, 0.7).parts, STEPS)
+    with_step_of(run, 0.7).ahead.choose_steps(STEPS)
     assert few < run.optimiser.schedule.steps < STEPS
 
 
@@ -87,7 +81,7 @@ def test_time_that_an_adjustment_leaves_goes_to_the_field_at_the_poses_it_found(
 ):
     run = with_step_of(begun(scene, tmp_path), 1.0)
     run.end_in(100)  # as far as was known before it
-    choose_steps(*run.parts, STEPS)
+    run.ahead.choose_steps(STEPS)
     few = run.optimiser.schedule.steps
     run.optimiser.start_reconstruction()
     run.optimiser.poses_held = True
@@ -95,7 +89,7 @@ def test_time_that_an_adjustment_leaves_goes_to_the_field_at_the_poses_it_found(
     run.optimiser.end_after(LEARNING)
     assert run.optimiser.schedule.steps < few
     run.end_in(seconds)
-    choose_steps(*run.parts, STEPS)
+    run.ahead.choose_steps(STEPS)
     found = run.optimiser.schedule.steps
     assert found > few
     if steps is None:
@@ -121,7 +115,7 @@ def test_a_run_is_planned_again_at_each_check_of_stage_2(scene, tmp_path):
 @pytest.mark.slow
 def test_a_run_without_time_ends_early_and_says_what_it_took(scene, tmp_path):
     run = begun(scene, tmp_path, time_budget_s=0.01)
-    keep_to_budget(*run.parts, time.monotonic(), STEPS)
+    run.ahead.keep_to_budget(time.monotonic(), STEPS)
     assert finished(run)
     assert MEASURED_STEPS <= run.optimiser.step_index == round(BIRESNERF.finish.least_steps * STEPS)
     (warning,) = budget_warnings(run.optimiser.options.time_budget_s, run.state.record.seconds)
@@ -131,7 +125,7 @@ def test_a_run_without_time_ends_early_and_says_what_it_took(scene, tmp_path):
 @pytest.mark.slow
 def test_a_run_without_a_budget_takes_all_its_steps(scene, tmp_path):
     run = begun(scene, tmp_path, steps=60, coarse_steps_min=10, coarse_steps_max=20)
-    keep_to_budget(*run.parts, time.monotonic(), 60)
+    run.ahead.keep_to_budget(time.monotonic(), 60)
     assert (run.state.ends, finished(run)) == (math.inf, True)
     assert run.optimiser.step_index == 60
     assert budget_warnings(run.optimiser.options.time_budget_s, run.state.record.seconds) == ()
@@ -139,17 +133,17 @@ def test_a_run_without_a_budget_takes_all_its_steps(scene, tmp_path):
 
 def test_time_before_an_interruption_counts_against_the_budget(scene, tmp_path):
     run = begun(scene, tmp_path, time_budget_s=200.0)
-    keep_to_budget(*run.parts, 1000.0, STEPS)
+    run.ahead.keep_to_budget(1000.0, STEPS)
     whole = run.state.ends
     run.state.record.seconds.update(preparing=20.0, coarse=30.0)
-    keep_to_budget(*run.parts, 1000.0, STEPS)
+    run.ahead.keep_to_budget(1000.0, STEPS)
     assert run.state.ends == pytest.approx(whole - 50.0)
 
 
 @pytest.mark.slow
 def test_a_resumed_run_keeps_the_lengths_that_were_chosen(scene, tmp_path):
     run = begun(scene, tmp_path, time_budget_s=0.01)
-    keep_to_budget(*run.parts, time.monotonic(), STEPS)
+    run.ahead.keep_to_budget(time.monotonic(), STEPS)
     assert finished(run)
     again = begun(scene, tmp_path, time_budget_s=0.01)
     again.stages.restore(load_checkpoint(tmp_path))

@@ -19,7 +19,7 @@ from biresnerf.data.workload import (
 from biresnerf.forecast.run_forecast import Forecast
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.similarity import Similarity
-from biresnerf.refinement.finish.work_ahead import expect_as_measured, expect_rest, expect_run, work_ahead
+from biresnerf.refinement.finish.work_ahead import expect_run
 from tests.refinement.tiny_scene import (
     TinyRun,
     given_scene,
@@ -43,7 +43,7 @@ def run_of(scene, tmp_path):
         dataset, images = scene
         optimiser = tiny_optimiser(dataset, images, tiny_options(**options))
         run = TinyRun(optimiser, replace(given_scene(dataset, images), tracks=tracks), tmp_path)
-        expect_rest(*run.parts)
+        run.ahead.expect_all()
         return run
 
     return make
@@ -60,13 +60,13 @@ def test_with_tracks_fewer_steps_are_taken_and_adjusted_cameras_are_checked(run_
 
 def test_what_was_adjusted_once_is_adjusted_once_more_and_not_checked_again(run_of):
     run = run_of(TRACKS)
-    before = work_ahead(*run.parts)
+    before = run.ahead.left()
     run.state.note(adjusted=True)
-    after = work_ahead(*run.parts)
+    after = run.ahead.left()
     assert after["adjusting"] == before["adjusting"] / 2
     assert after["checking"] == 0
     run.state.note(adjusts_again=False)
-    assert work_ahead(*run.parts)["adjusting"] == 0
+    assert run.ahead.left()["adjusting"] == 0
 
 
 @pytest.mark.parametrize(("off", "asked"), [(0.0, False), (0.1, True)])
@@ -79,14 +79,14 @@ def test_photos_are_expected_to_judge_only_cameras_that_matches_would_move_visib
         2.0, np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([1.0, 2.0, 3.0])
     ).apply_to_poses(moved)
     run.scene = replace(run.scene, start=replace(run.scene.start, matched_poses=turned))
-    assert (work_ahead(*run.parts)["checking"] > 0) == asked
-    expect_as_measured(*run.parts)
+    assert (run.ahead.left()["checking"] > 0) == asked
+    run.ahead.expect()
     assert (run.forecast.left["checking"] > 0) == asked
 
 
 def test_the_verdict_takes_time_only_where_it_is_asked_for(run_of):
-    assert work_ahead(*run_of(verdict=False).parts)["judging"] == 0
-    few, many = (work_ahead(*run_of(trial_steps=steps).parts)["judging"] - JUDGING for steps in (50, 100))
+    assert run_of(verdict=False).ahead.left()["judging"] == 0
+    few, many = (run_of(trial_steps=steps).ahead.left()["judging"] - JUDGING for steps in (50, 100))
     assert many > 0
     assert many == pytest.approx(2 * few)
 
@@ -99,7 +99,7 @@ def test_many_cameras_take_more_than_in_proportion():
 
 
 def test_methods_of_others_do_not_adjust(run_of):
-    assert work_ahead(*run_of(method="biresnerf-paper").parts)["adjusting"] == 0
+    assert run_of(method="biresnerf-paper").ahead.left()["adjusting"] == 0
 
 
 def test_a_run_from_given_poses_is_known_before_its_first_step(scene, run_of):

@@ -26,7 +26,7 @@ from biresnerf.refinement.scene.scene_frame import scene_frame
 from biresnerf.refinement.stages.checkpoint import load_checkpoint
 from biresnerf.refinement.verdict.evaluate import Evaluation
 from biresnerf.refinement.verdict.pose_uncertainty import LOST, pose_uncertainty
-from biresnerf.refinement.verdict.run_report import Findings, run_report
+from biresnerf.refinement.verdict.run_report import Findings
 from biresnerf.write.output_folder import OutputFolder
 from biresnerf.write.result import write_result
 from tests.refinement.tiny_scene import (
@@ -199,8 +199,10 @@ def test_the_report_names_those_that_stay_lost_and_those_repaired(scene, tmp_pat
     dataset, lost = scene[0], run.optimiser.camera_errors.lost.numpy()
     known = pose_uncertainty(dataset, run.optimiser.joint, Finish(), None, lost)
     found = Findings(uncertainty=known)
-    partial = run_report(run.scene, run.optimiser, run.state.record, run.repair.repaired, found)
-    report = write_result(OutputFolder(tmp_path), run.scene, run.optimiser, Monitor(), Evaluation(), partial)
+    partial = run.report(found)
+    report = write_result(
+        OutputFolder(tmp_path), run.scene, run.optimiser.joint, Monitor(), Evaluation(), partial
+    )
     lost = [image.name for image in report.images if image.uncertainty.why_unknown == LOST]
     assert lost == [dataset.names[TURNED]]
     assert [image.name for image in report.images if image.repaired] == [dataset.names[ORBITED]]

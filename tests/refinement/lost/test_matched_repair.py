@@ -11,7 +11,7 @@ import torch
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.pixel_rays import pixels_of_points
 from biresnerf.geometry.pose_error import rotation_between_deg
-from biresnerf.refinement.lost.lost_cameras import MatchedRepair
+from biresnerf.refinement.lost.lost_cameras import LostCameraRepair
 from biresnerf.refinement.lost.own_matches import OwnMatches
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from tests.refinement.tiny_scene import given_scene, tiny_optimiser, tiny_options, tiny_set
@@ -44,21 +44,28 @@ def away(pose: np.ndarray) -> torch.Tensor:
     return torch.from_numpy((pose @ np.diag([-1.0, 1, -1, 1]))[:3]).float()
 
 
+def placed(optimiser: JointOptimiser, own: OwnMatches | None) -> list[int]:
+    """The cameras that their own matches place elsewhere."""
+    repair = LostCameraRepair(optimiser, own)
+    repair.place_by_matches()
+    return repair.repaired
+
+
 def test_a_camera_that_its_matches_contradict_is_placed_by_them(scene):
     optimiser, own = begun(scene)
     truth = optimiser.poses.poses().numpy()
     optimiser.replace_pose(LOST, away(truth[LOST]))
-    assert MatchedRepair(optimiser, own).place() == [LOST]
+    assert placed(optimiser, own) == [LOST]
     found = optimiser.poses.poses().numpy()
     assert rotation_between_deg(found, truth).max() < 1.5  # a pixel is two degrees wide
     assert np.linalg.norm(found[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.1
-    assert MatchedRepair(optimiser, own).place() == []
+    assert placed(optimiser, own) == []
 
 
 def test_nothing_happens_without_matches(scene):
     optimiser, _ = begun(scene)
     optimiser.replace_pose(LOST, away(optimiser.poses.poses().numpy()[LOST]))
-    assert MatchedRepair(optimiser, None).place() == []
+    assert placed(optimiser, None) == []
 
 
 @pytest.mark.parametrize("tied", ["fixed", "of a rig"])
@@ -69,13 +76,15 @@ def test_cameras_that_cannot_move_alone_stay(scene, tied):
         optimiser.bodies.fixed[LOST] = True
     else:
         optimiser.bodies.of[LOST:] -= 1  # one body with the camera before it
-    assert MatchedRepair(optimiser, own).place() == []
+    assert placed(optimiser, own) == []
 
 
 def test_matches_object_to_poses_that_fit_them_less(scene):
     optimiser, own = begun(scene)
     truth = optimiser.poses.poses().numpy()
-    assert MatchedRepair(optimiser, own).object_to(LOST, away(truth[LOST]))
-    assert not MatchedRepair(optimiser, None).object_to(LOST, away(truth[LOST]))
+    assert LostCameraRepair(optimiser, own).matches_object_to(LOST, away(truth[LOST]))
+    assert not LostCameraRepair(optimiser, None).matches_object_to(LOST, away(truth[LOST]))
     optimiser.replace_pose(LOST, away(truth[LOST]))
-    assert not MatchedRepair(optimiser, own).object_to(LOST, torch.from_numpy(truth[LOST, :3]).float())
+    assert not LostCameraRepair(optimiser, own).matches_object_to(
+        LOST, torch.from_numpy(truth[LOST, :3]).float()
+    )

@@ -8,7 +8,6 @@ import torch
 from biresnerf.geometry.pose_error import pose_error
 from biresnerf.refinement.optimise.device_memory import smaller_batches, step_that_fits
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
-from biresnerf.refinement.verdict.run_report import run_report
 from tests.refinement.tiny_scene import TinyRun, finished, given_scene, tiny_optimiser, tiny_options, tiny_set
 
 OPTIONS = tiny_options(samples_per_step=1 << 16)
@@ -48,7 +47,7 @@ def test_a_run_without_enough_memory_ends_with_smaller_batches_and_says_so(scene
     assert max(through) <= 400
     assert optimiser.batch_share < 1
     assert pose_error(optimiser.poses.poses().numpy(), scene[0].world_from_cam).aligned.rotation_deg.mean < 5
-    warnings = run_report(run.scene, optimiser, run.state.record, []).warnings
+    warnings = run.report().warnings
     assert any("GPU's memory is too small" in warning for warning in warnings)
 
 

@@ -64,7 +64,7 @@ def judged(
     dataset, images = scene
     optimiser = tiny_optimiser(with_poses(dataset, refined), images, OPTIONS, [3], method)
     run = replace(given_scene(with_poses(dataset, given), images, [3]), tracks=tracks)
-    return judge_poses(*TinyRun(optimiser, run, Path()).parts)
+    return TinyRun(optimiser, run, Path()).judged()
 
 
 def test_true_poses_in_place_of_noisy_ones_are_an_improvement(scene, noisy):
@@ -101,7 +101,7 @@ def test_a_gain_that_may_be_blurs_says_nothing_where_time_ends_before_longer_tra
     run = TinyRun(optimiser, given_scene(with_poses(dataset, noisy), images, [3]), Path())
     run.forecast.rates["trial step"], run.forecast.left["judging"] = 1.0, rounds_s
     run.end_in(1.5 * rounds_s)
-    hurried = judge_poses(*run.parts).verdict
+    hurried = run.judged().verdict
     assert hurried.heldout.psnr.finding == "better"
     assert (hurried.verdict, hurried.returned) == ("inconclusive", "input")
     assert "too much to tell" in hurried.why[0]
@@ -129,7 +129,7 @@ def test_trainings_end_once_they_decide_but_for_pictures(scene, monkeypatch):
         parts = TinyRun(optimiser, run, Path())
         monkeypatch.setattr(parts.forecast, "advance", shares.append)
         monkeypatch.setattr(parts.forecast, "took", works.append)
-        judgement = judge_poses(*parts.parts)
+        judgement = parts.judged()
         assert judgement.verdict.heldout.steps == decided
         assert works == [workload.JUDGING + 2 * (max(pictured, decided) + other_rounds)]
         if not other_rounds:
@@ -146,7 +146,7 @@ def test_trainings_end_once_they_agree_with_what_matches_say(scene, monkeypatch)
     def steps(given: np.ndarray, refined: np.ndarray, tracks: Tracks | None) -> int:
         optimiser = tiny_optimiser(with_poses(dataset, refined), images, options, held_out=[3])
         run = replace(given_scene(with_poses(dataset, given), images, [3]), tracks=tracks)
-        return judge_poses(*TinyRun(optimiser, run, Path()).parts).verdict.heldout.steps
+        return TinyRun(optimiser, run, Path()).judged().verdict.heldout.steps
 
     matches = true_matches(dataset)
     assert steps(noisy, truth, matches) == steps(truth, noisy, matches) < 80
@@ -202,7 +202,7 @@ def test_images_whose_poses_were_guessed_have_no_part_in_the_trials(scene, noisy
         frames[1] = replace(frames[1], pose_source="nearest-view")
         run = given_scene(replace(dataset, frames=tuple(frames)), images, [3])
         optimiser = tiny_optimiser(with_poses(dataset, refined), images, OPTIONS, [3], method)
-        return judge_poses(*TinyRun(optimiser, run, Path()).parts)
+        return TinyRun(optimiser, run, Path()).judged()
 
     found = judged_with_a_guess(truth[0])
     assert found.verdict.verdict == "improved"

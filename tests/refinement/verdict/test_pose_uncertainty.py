@@ -80,7 +80,7 @@ def test_without_evidence_nothing_is_said_to_be_known(tmp_path, rng):
 def test_a_pose_that_its_own_matches_contradict_is_not_known(tmp_path, rng):
     run, _ = begun(tmp_path, rng)
     finish = adjusted(run)
-    judgement = judge_poses(*run.parts)
+    judgement = run.judged()
     name = "contradicted_before" if judgement.verdict.returned == "input" else "contradicted"
     known = known_of(run, finish, replace(judgement, **{name: np.arange(VIEWS) == 3}))
     assert [each.why_unknown for each in known] == [
@@ -95,9 +95,7 @@ def test_matches_speak_for_poses_only_where_they_determine_most_of_them(tmp_path
     evidence = finish.fit.evidence
     of_few = replace(evidence, tracks=evidence.tracks.where(evidence.tracks.image < VIEWS // 3))
     open_ = replace(finish, fit=replace(finish.fit, evidence=of_few))
-    told, untold, refused, never = (
-        judge_poses(*run.parts, finish=each) for each in (finish, open_, finish.refused(), Finish())
-    )
+    told, untold, refused, never = (run.judged(each) for each in (finish, open_, finish.refused(), Finish()))
     assert (told.verdict.verdict, told.verdict.returned) == ("improved", "refined")
     assert 0 < untold.errors.known.sum() < VIEWS / 2
     assert (untold.verdict.verdict, untold.verdict.returned) == ("inconclusive", "input")
@@ -109,7 +107,7 @@ def test_matches_speak_for_poses_only_where_they_determine_most_of_them(tmp_path
 def test_what_the_verdict_found_of_the_errors_is_what_the_report_has(tmp_path, rng):
     run, _ = noisy_run(tmp_path, rng)
     finish = adjusted(run)
-    judgement = judge_poses(*run.parts, finish=finish)
+    judgement = run.judged(finish)
     assert judgement.verdict.returned == "refined"
     assert judgement.errors is not None
     assert known_of(run, finish, judgement) == known_of(run, finish, replace(judgement, errors=None))

@@ -34,6 +34,11 @@ def no_training(monkeypatch):
     monkeypatch.setattr(judgement, "compare_placed", refuse)
 
 
+def so_far(run: TinyRun) -> SoFar:
+    made = run.optimiser
+    return poses_so_far(run.scene, made.joint, made.camera_errors, made.recipe, run.state)
+
+
 class Wandering:
     """A run that was given poses of a noise, and whose optimiser moves as told."""
 
@@ -66,7 +71,7 @@ class Wandering:
         optimiser = self.run.optimiser
         unit_from_cam = optimiser.frame.unit_from_world.apply_to_poses(world_from_cam)
         optimiser.poses.place(torch.from_numpy(unit_from_cam))
-        return poses_so_far(*self.run.parts)
+        return so_far(self.run)
 
     def error_deg(self, offered: SoFar) -> float:
         poses, _ = offered.offered(self.run.scene)
@@ -129,7 +134,7 @@ def test_a_resumed_run_offers_the_best_poses_of_the_one_that_was_interrupted(sce
     good, _ = run.at(0.01).offered(run.run.scene)
     run.at(0.2)
     run.resume()
-    offered = poses_so_far(*run.run.parts)
+    offered = so_far(run.run)
     assert offered.verdict.verdict == "improved"
     np.testing.assert_allclose(offered.offered(run.run.scene)[0], good, atol=1e-12)
     np.testing.assert_allclose(run.at(0.3).offered(run.run.scene)[0], good, atol=1e-12)
