@@ -30,7 +30,7 @@ from biresnerf.forecast.rates import cache_folder
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.refinement.adjustment.adjustment import adjust_poses, misfit
-from biresnerf.refinement.adjustment.evidence import Evidence, NoiseLevels, PatchPhotos, PosePrior
+from biresnerf.refinement.adjustment.evidence import Evidence, PatchPhotos, PosePrior
 from biresnerf.refinement.adjustment.patch_points import Surfaces, find_patches
 from biresnerf.refinement.kernels.batch_errors import add_errors
 from biresnerf.refinement.kernels.draw_pixels import draw_pixels
@@ -163,7 +163,7 @@ def _adjust_two_cameras() -> None:
     tracks = Tracks(np.repeat(np.arange(len(left)), 2), np.tile(np.arange(2), len(left)), xy)
     evidence = Evidence(intrinsics, tracks, patches)
     adjust_poses(poses, evidence, PosePrior.equal(poses, 0.02, 0.02))
-    misfit(poses, evidence, NoiseLevels())
+    misfit(poses, evidence, 1.0)
 
 
 def _compile_part(part: str) -> None:

@@ -12,7 +12,7 @@ from numba.core.registry import cpu_target
 
 from biresnerf.compile_kernels import compile_kernels
 from biresnerf.refinement.adjustment.adjustment import adjust_poses, misfit
-from biresnerf.refinement.adjustment.evidence import Evidence, NoiseLevels, PosePrior
+from biresnerf.refinement.adjustment.evidence import Evidence, PosePrior
 from biresnerf.refinement.adjustment.kernels import patches, tracks
 from biresnerf.refinement.adjustment.lens.lenses import Lenses
 from tests.refinement.adjustment.rig import disturbed, observed
@@ -42,7 +42,7 @@ def test_an_adjustment_of_cameras_and_lenses_compiles_nothing_more():
     lenses = Lenses(np.zeros(9, np.int64), np.zeros((1, 8)), np.array([[0.1] + [0.0] * 7]))
     evidence = Evidence(plane.intrinsics, seen, plane.evidence(start).patches, lenses)
     found = adjust_poses(start, evidence, PosePrior.equal(start, 0.02, 0.06))
-    misfit(found.world_from_cam, evidence, NoiseLevels())
+    misfit(found.world_from_cam, evidence, 1.0)
     assert found.used
     assert len(before) >= 7
     assert compiled() == before

@@ -89,7 +89,7 @@ def ours(optimiser: JointOptimiser, image: Tensor, xy: Tensor, photo: Tensor) ->
         "weights": torch.cat([p.grad.reshape(-1) for p in optimiser.field.parameters if p.grad is not None]),
     }
     found = {name: value.clone() for name, value in found.items()}
-    poses.forget_gradients()
+    poses.rotation.grad = poses.translation.grad = None
     optimiser.field.discard_gradients()
     return found
 

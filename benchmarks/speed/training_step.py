@@ -14,7 +14,7 @@ from benchmarks.speed import scene
 from benchmarks.speed.clock import Clock, interleave, peak_memory, ratio, summary, timed
 from biresnerf.field.cpu import field as cpu_field
 from biresnerf.field.reference.field import ReferenceField
-from biresnerf.refinement.optimise import joint_step
+from biresnerf.refinement.optimise import joint_optimiser
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.photo_sampler import PhotoSampler
 from biresnerf.refinement.parameters.pose_parameters import PoseParameters
@@ -22,8 +22,8 @@ from biresnerf.refinement.parameters.pose_parameters import PoseParameters
 OPERATIONS = [
     (PhotoSampler, "draw", "draw pixels"),
     (PoseParameters, "matrices", "pose matrices"),
-    (joint_step, "viewing_directions", "cast rays"),
-    (joint_step, "cast_rays", "cast rays"),
+    (joint_optimiser, "viewing_directions", "cast rays"),
+    (joint_optimiser, "cast_rays", "cast rays"),
     (cpu_field, "harmonics", "view harmonics"),
     (cpu_field.march_kernels, "march", "march"),
     (cpu_field.march_kernels, "pack", "pack samples"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from biresnerf.arrays import Array
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_by_spread
 from biresnerf.refinement.adjustment.cameras import POSE, Cameras
-from biresnerf.refinement.adjustment.evidence import Evidence, NoiseLevels, PosePrior
+from biresnerf.refinement.adjustment.evidence import Evidence, PosePrior
 from biresnerf.refinement.adjustment.kernels.patches import UNSEEN
 from biresnerf.refinement.adjustment.lens.lenses import (
     KINDS,
@@ -29,35 +29,30 @@ from biresnerf.refinement.adjustment.track_term import ROBUST_SCALE, TrackTerm
 from biresnerf.refinement.numbers.finish import EvidenceNumbers
 
 
-@dataclass(frozen=True)
-class Agreement:
+@dataclass(frozen=True, eq=False)
+class Halves:
     """Whether patches know what they say: two halves of them, adjusted to on their own.
 
     Attributes:
+        middle: cameras between the two results.
+        noise: level of the patches' noise.
+        inliers: share of comparisons within the robust scale; if it was too small from the start, nothing was adjusted.
         apart_deg: mean rotation between the two results, aligned.
         moved_deg: mean rotation from the start to their mean, aligned.
-        inliers: share of comparisons within the robust scale; if it was too small from the start, nothing was adjusted.
     """
 
-    apart_deg: float
-    moved_deg: float
+    middle: Cameras = field(repr=False)
+    noise: float
     inliers: float
-    numbers: EvidenceNumbers
+    numbers: EvidenceNumbers = field(repr=False)
+    apart_deg: float = 0.0
+    moved_deg: float = 0.0
 
     @property
     def trusted(self) -> bool:
         """Whether the halves found much the same, from enough comparisons that fit."""
         bound_deg = self.numbers.most_apart * self.moved_deg + self.numbers.still_deg
         return self.apart_deg < bound_deg and self.inliers > self.numbers.least_inliers
-
-
-@dataclass(frozen=True, eq=False)
-class Halves:
-    """Cameras between the results of two halves of the patches, their noise level, and how far they are apart."""
-
-    middle: Cameras
-    noise: float
-    agreement: Agreement
 
 
 NOTHING_FITS = ROBUST_SCALE**2  # a misfit is below it
@@ -71,9 +66,8 @@ class Adjustment:
         world_from_cam: [n, 4, 4].
         track_noise_px, patch_noise: measured; NaN where there is no such evidence.
         track_inliers, patch_inliers: share of residuals within the robust scale; NaN likewise.
-        agreement: of the halves of the patches; None where there are none.
         used: whether there was any evidence to adjust to; otherwise the poses are those given.
-        halves: what was found of the patches on the way, for another adjustment from the same poses.
+        halves: of the patches, as found on the way; None where there are none.
         lenses: what was found of them; None where the evidence has none.
     """
 
@@ -82,16 +76,14 @@ class Adjustment:
     patch_noise: float
     track_inliers: float
     patch_inliers: float
-    agreement: Agreement | None
     used: bool
     halves: Halves | None = None
     lenses: LensEstimate | None = None
 
     @property
-    def noise(self) -> NoiseLevels:
-        """The measured noise levels, to judge other poses by."""
-        one = NoiseLevels()
-        return NoiseLevels(self.track_noise_px if np.isfinite(self.track_noise_px) else one.track_px)
+    def known_noise_px(self) -> float:
+        """That of the tracks, to judge other poses by; one where it was not measured."""
+        return self.track_noise_px if np.isfinite(self.track_noise_px) else 1.0
 
 
 def adjust_poses(
@@ -130,7 +122,7 @@ def _adjusted(
     if halves is None and evidence.patches is not None and len(evidence.patches) > 1:
         halves = _halves(cameras, evidence, before)
     start, patch_noise = (cameras, 1.0) if halves is None else (halves.middle, halves.noise)
-    if halves is not None and not halves.agreement.trusted:
+    if halves is not None and not halves.trusted:
         start, evidence = cameras, replace(evidence, patches=None)
     tracks, patches = track_term(start, evidence, None), patch_term(start, evidence, patch_noise)
     terms: list[Term] = [term for term in (tracks, patches) if term is not None]
@@ -145,7 +137,6 @@ def _adjusted(
         patch_noise=patch_noise if patches else np.nan,
         track_inliers=float(tracks.inliers(found).mean()) if tracks else np.nan,
         patch_inliers=float(patches.inliers(found).mean()) if patches else np.nan,
-        agreement=halves.agreement if halves else None,
         used=bool(terms),
         halves=halves,
         lenses=_lens_estimate(found, terms, lenses, evidence.numbers) if lenses is not None else None,
@@ -163,7 +154,7 @@ def _halves(cameras: Cameras, evidence: Evidence, prior: Prior) -> Halves:
     terms = [PatchTerm(part, evidence.intrinsics, cameras, numbers) for part in parts]
     fitting = float(np.mean([term.inliers(cameras).mean() for term in terms]))
     if not fitting > numbers.least_inliers:  # the field shows no surface that photos agree on
-        return Halves(cameras, 1.0, Agreement(0.0, 0.0, fitting, numbers))
+        return Halves(cameras, 1.0, fitting, numbers)
     ends, expected, inliers = [], 0.0, []
     for term in terms:
         end = minimise(cameras, [term], prior)
@@ -175,11 +166,10 @@ def _halves(cameras: Cameras, evidence: Evidence, prior: Prior) -> Halves:
         expected += float(np.trace(turned, axis1=1, axis2=2).mean())
     middle = ends[1].moved(ends[0].apart(ends[1]) / 2)
     apart = _rotations_deg(ends[0], ends[1])
-    agreement = Agreement(
-        float(apart.mean()), float(_rotations_deg(middle, cameras).mean()), float(np.mean(inliers)), numbers
-    )
+    moved_deg = float(_rotations_deg(middle, cameras).mean())
     noise = float(np.sqrt(np.mean(np.radians(apart) ** 2) / max(expected, 1e-300)))
-    return Halves(middle, max(1.0, noise) if np.isfinite(noise) else 1.0, agreement)
+    noise = max(1.0, noise) if np.isfinite(noise) else 1.0
+    return Halves(middle, noise, float(np.mean(inliers)), numbers, float(apart.mean()), moved_deg)
 
 
 def _rotations_deg(one: Cameras, other: Cameras) -> Array:
@@ -197,22 +187,23 @@ def _lens_estimate(
     return LensEstimate(cameras.lens, deviation, observable)
 
 
-def misfit(world_from_cam: Array, evidence: Evidence, noise: NoiseLevels) -> Array:
+def misfit(world_from_cam: Array, evidence: Evidence, noise_px: float) -> Array:
     """How badly poses fit evidence that they were not adjusted to: each camera's mean robust square [n].
 
     Points are estimated anew for these poses, as are the depths of patches: poses must be in their frame. A residual e,
     in noise levels, counts S^2 e^2 / (S^2 + e^2), below `NOTHING_FITS`. NaN for a camera that no evidence is of.
 
     Args:
-        noise: as measured by an adjustment; must be the same for all poses that are compared.
+        noise_px: standard deviation of either coordinate of an observation at poses without error, as measured by an
+            adjustment; must be the same for all poses that are compared.
     """
     cameras = Cameras.of(world_from_cam, evidence.lenses)
     n = len(cameras)
     total, count = np.zeros(n), np.zeros(n)
-    tracks = track_term(cameras, evidence, noise.track_px)
+    tracks = track_term(cameras, evidence, noise_px)
     if tracks is not None:
         tracks.settle(cameras)
-        robust = _robust((tracks.errors_px(cameras) / noise.track_px) ** 2, ROBUST_SCALE)
+        robust = _robust((tracks.errors_px(cameras) / noise_px) ** 2, ROBUST_SCALE)
         total += np.bincount(tracks.image, robust, n)
         count += np.bincount(tracks.image, minlength=n)
     patches = patch_term(cameras, evidence, 1.0)

@@ -206,14 +206,3 @@ class PosePrior:
     def fixed_bodies(self) -> RigidBodies | None:
         """The bodies with all cameras fixed that cannot move."""
         return None if self.bodies is None else RigidBodies(self.bodies.of, self.fixed)
-
-
-@dataclass(frozen=True)
-class NoiseLevels:
-    """How far residuals are from zero at poses without error.
-
-    Attributes:
-        track_px: standard deviation of either coordinate of an observation.
-    """
-
-    track_px: float = 1.0

@@ -71,13 +71,13 @@ def as_candidate(
 
 def usable(found: Adjustment) -> bool:
     """Whether an adjustment is to be believed."""
-    return found.used and (found.agreement is None or found.agreement.trusted)
+    return found.used and (found.halves is None or found.halves.trusted)
 
 
 def _described(found: Adjustment) -> str:
     return (
         f"tracks {found.track_noise_px:.2f} px, {found.track_inliers:.2f} of them within, "
-        f"patches {found.patch_inliers:.2f}, {found.agreement}"
+        f"patches {found.patch_inliers:.2f}, {found.halves}"
     )
 
 

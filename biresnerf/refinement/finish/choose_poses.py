@@ -18,7 +18,7 @@ from biresnerf.options.refine_options import ResolvedOptions
 from biresnerf.refinement.adjustment.adjustment import NOTHING_FITS, Adjustment, adjust_poses, misfit
 from biresnerf.refinement.adjustment.cameras import Cameras
 from biresnerf.refinement.adjustment.choice import Candidate, Choice, choose
-from biresnerf.refinement.adjustment.evidence import Evidence, NoiseLevels, PosePrior
+from biresnerf.refinement.adjustment.evidence import Evidence, PosePrior
 from biresnerf.refinement.adjustment.measured_terms import control_believed, measured_misfits
 from biresnerf.refinement.adjustment.solver.covariance import NOTHING_KNOWN
 from biresnerf.refinement.finish.candidates import (
@@ -67,9 +67,9 @@ def choose_poses(
     if heeding is not None and not _believes_control(heeding, split.fitted):
         logger.info("control points are not believed: too many contradict the photos")
         split, prior, results = _adjusted(gathered.without_control(), refined, joint, cameras, announce)
-    noise = results["adjusted-tracks"].noise if "adjusted-tracks" in results else NoiseLevels()
-    if noise.track_px > _most_noise_px(split.fitted):
-        logger.info("tracks say nothing: their noise is %.1f px", noise.track_px)
+    noise_px = results["adjusted-tracks"].known_noise_px if "adjusted-tracks" in results else 1.0
+    if noise_px > _most_noise_px(split.fitted):
+        logger.info("tracks say nothing: their noise is %.1f px", noise_px)
         split = split.without_tracks()
         results = {name: each for name, each in results.items() if name == "adjusted-patches"}
     given = input_accuracy(scene.dataset, most_heeded(results), split.fitted, options)
@@ -81,7 +81,7 @@ def choose_poses(
     found = [Candidate("refined", refined), *without_adjustment(scene, refined, joint.bodies)]
     candidates = sorted([*found, *filter(None, adjusted)], key=lambda candidate: ORDER.index(candidate.name))
     # Fixed cameras are the same in all candidates: theirs tell only whose points fit them.
-    misfits = _misfits(candidates, split, noise, ~prior.fixed & split.placed, announce)
+    misfits = _misfits(candidates, split, noise_px, ~prior.fixed & split.placed, announce)
     if not misfits:
         return None
     by_tracks = results.get("adjusted-tracks")
@@ -91,7 +91,7 @@ def choose_poses(
         misfits[kind], alike[kind] = misfit_to, as_well
     choice = _choice(candidates, misfits, alike, scene.start)
     if choice.chosen.name in OF_MATCHES and by_tracks is not None and "tracks" in misfits:
-        misfits["tracks"] = _as_if_left_out(candidates, misfits["tracks"], split, prior, noise, cameras)
+        misfits["tracks"] = _as_if_left_out(candidates, misfits["tracks"], split, prior, noise_px, cameras)
         choice = _choice(candidates, misfits, alike, scene.start)
     announce()
     chosen, evidence = choice.chosen, dict.fromkeys(results, split.fitted)
@@ -105,7 +105,7 @@ def choose_poses(
     focals = focal_certainty(
         best,
         split.fitted,
-        contradicted_focals(refined, split.fitted, split.left_out, prior, noise, kept, by_tracks),
+        contradicted_focals(refined, split.fitted, split.left_out, prior, noise_px, kept, by_tracks),
     )
     return chosen, Finish(choice.reports, fit_of(candidates, results, evidence), given), focals
 
@@ -159,7 +159,7 @@ def _kept_on_a_tie(
 def _misfits(
     candidates: Sequence[Candidate],
     split: SplitEvidence,
-    noise: NoiseLevels,
+    noise_px: float,
     judging: NDArray[np.bool_],
     announce: Callable[[], None],
 ) -> dict[str, Array]:
@@ -171,7 +171,7 @@ def _misfits(
     ):
         if left_out.tracks is not None or left_out.patches is not None:
             announce()
-            misfits = np.stack([_misfit(each, left_out, noise) for each in candidates])[:, judging]
+            misfits = np.stack([_misfit(each, left_out, noise_px) for each in candidates])[:, judging]
             if _tells(misfits):
                 found[kind] = misfits
     return found
@@ -193,9 +193,9 @@ def _within(
     return np.array([each.deviations < evidence.numbers.told_apart for each in found])
 
 
-def _misfit(candidate: Candidate, evidence: Evidence, noise: NoiseLevels) -> Array:
+def _misfit(candidate: Candidate, evidence: Evidence, noise_px: float) -> Array:
     """Of its own poses and lenses."""
-    return misfit(candidate.world_from_cam, replace(evidence, lenses=candidate.lenses), noise)
+    return misfit(candidate.world_from_cam, replace(evidence, lenses=candidate.lenses), noise_px)
 
 
 def _as_if_left_out(
@@ -203,7 +203,7 @@ def _as_if_left_out(
     misfits: Array,
     split: SplitEvidence,
     prior: PosePrior,
-    noise: NoiseLevels,
+    noise_px: float,
     cameras: Sequence[Camera],
 ) -> Array:
     """Misfits [candidates, m] to tracks, where poses of matches know nothing of the tracks that judge.
@@ -221,7 +221,7 @@ def _as_if_left_out(
     found = adjust_poses(matched.world_from_cam, evidence, around)
     known = None if found.lenses is None or simple is None else simple.known(found.lenses.correction)
     again = _misfit(
-        replace(matched, world_from_cam=found.world_from_cam, lenses=known), split.left_out, noise
+        replace(matched, world_from_cam=found.world_from_cam, lenses=known), split.left_out, noise_px
     )
     judged = again[~prior.fixed & split.placed]
     judging = misfits.copy()

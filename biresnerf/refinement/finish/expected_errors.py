@@ -117,7 +117,7 @@ def expected_errors(
         before = np.where(free, 1 / np.where(lenses.free, lenses.deviation, 1.0).reshape(-1) ** 2, 0.0)
         information = information.with_diagonal(np.concatenate([np.zeros(6 * n), before]))
     found = covariance(cameras, information, free, (by_tracks | by_patches) & together, bodies)
-    known = together & (_rotation(found) < numbers.most_rotation)
+    known = together & (np.sqrt(np.trace(found[:, :3, :3], axis1=1, axis2=2)) < numbers.most_rotation)
     if not known.all():  # what is not known must not turn the others' frame
         found = covariance(cameras, information, free, known, bodies)
     away = np.full((n, 6), np.nan)
@@ -136,11 +136,6 @@ def _turn(b_from_a: Similarity) -> Array:
     turn = np.zeros((6, 6))
     turn[:3, :3], turn[3:, 3:] = b_from_a.rotation, b_from_a.scale * b_from_a.rotation
     return turn
-
-
-def _rotation(moments: Array) -> Array:
-    """Root mean square rotation errors [n], rad."""
-    return np.asarray(np.sqrt(np.trace(moments[:, :3, :3], axis1=1, axis2=2)))
 
 
 def bound_90(moments: Array, away: Array) -> Array:

@@ -14,7 +14,7 @@ from biresnerf.geometry.camera.lens import lens_problem
 from biresnerf.options.refine_options import RefineIntrinsics
 from biresnerf.refinement.adjustment.adjustment import Adjustment, adjust_poses, misfit
 from biresnerf.refinement.adjustment.choice import judged
-from biresnerf.refinement.adjustment.evidence import Evidence, NoiseLevels, PosePrior
+from biresnerf.refinement.adjustment.evidence import Evidence, PosePrior
 from biresnerf.refinement.adjustment.lens.corrected_camera import corner, corrected_camera
 from biresnerf.refinement.adjustment.lens.lenses import (
     ASPECT,
@@ -99,7 +99,7 @@ def contradicted_focals(
     fitted: Evidence,
     left_out: Evidence,
     prior: PosePrior,
-    noise: NoiseLevels,
+    noise_px: float,
     kept: Lenses,
     by_tracks: Adjustment | None,
 ) -> list[FocalCertainty | None]:
@@ -121,7 +121,7 @@ def contradicted_focals(
         return said
     with_lens = replace(left_out, lenses=kept.known(freed.lenses.correction))
     found = judged(
-        misfit(held.world_from_cam, left_out, noise), misfit(freed.world_from_cam, with_lens, noise)
+        misfit(held.world_from_cam, left_out, noise_px), misfit(freed.world_from_cam, with_lens, noise_px)
     )
     for i in np.flatnonzero(kept.free[:, 0]).tolist():
         off, deviation = freed.lenses.correction[i, 0], freed.lenses.deviation[i, 0]

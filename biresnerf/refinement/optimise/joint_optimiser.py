@@ -17,12 +17,11 @@ from biresnerf.geometry.perturb import RIG_DISTANCE
 from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.refinement.optimise.async_metrics import AsyncMetrics, StepResult
 from biresnerf.refinement.optimise.camera_errors import CameraErrors
-from biresnerf.refinement.optimise.joint_step import StepNumbers, joint_step
 from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.optimise.optimiser_state import Part, StepState, load_state_of, state_of
 from biresnerf.refinement.optimise.photo_sampler import PhotoSampler
 from biresnerf.refinement.optimise.pose_hypotheses import photo_distances
-from biresnerf.refinement.optimise.renderer import Renderer
+from biresnerf.refinement.optimise.renderer import Renderer, cast_rays, viewing_directions
 from biresnerf.refinement.parameters.exposure import Exposure
 from biresnerf.refinement.parameters.intrinsics_parameters import IntrinsicsParameters
 from biresnerf.refinement.parameters.joint_parameters import JointParameters
@@ -163,27 +162,54 @@ class JointOptimiser:
         self.field.reach(t / schedule.steps)
         if t % schedule.numbers.occupancy_period == 0 and self.method.pruned:
             self._update_occupancy(t)
-        told = self._numbers()
-        done = joint_step(self.renderer, self.sampler, self.camera_errors, self.method, told)
+        loss, error, samples = self._learn()
+        rays = self.rays
         self.step_index += 1
-        self._adapt_rays(done.samples, int(self.batch_share * schedule.samples(t, self.switch)))
-        loss, error = self.metrics.read(done.loss, done.error)
-        return StepResult(loss, error, told.rays, done.samples)
+        self._adapt_rays(samples, int(self.batch_share * schedule.samples(t, self.switch)))
+        of_loss, of_error = self.metrics.read(loss, error)
+        return StepResult(of_loss, of_error, rays, samples)
 
-    def _numbers(self) -> StepNumbers:
-        t, switch, schedule = self.step_index, self.switch, self.schedule
-        held = self.poses_held or not self.lenses.moving
-        return StepNumbers(
-            rays=self.rays,
-            marching=self.marching(schedule.interval(t, switch)),
-            gradient=schedule.position_gradient(t, switch),
-            rates=schedule.field_rates(t, switch),
-            blur=schedule.blur(t, switch, self.sampler.long_side),
-            pose_rate=self.pose_rate(),
-            mobility=self.mobility[0 if switch is None else 1],
-            lens_rate=0.0 if held else schedule.lens_rate(t, switch),
-            moves_focal=schedule.focal_moves(switch),
-        )
+    def _learn(self) -> tuple[Tensor, Tensor, int]:
+        """Draw pixels, render them, and move field, poses, lenses and exposures by the gradients of the loss.
+
+        Returns:
+            loss [] against the (blurred) targets, error [] of training rays against the sharp photos, and samples.
+        """
+        t, switch, schedule, renderer = self.step_index, self.switch, self.schedule, self.renderer
+        poses, exposure, rates = self.poses, self.exposure, schedule.field_rates(t, switch)
+        pose_rate, held = self.pose_rate(), self.poses_held or not self.lenses.moving
+        lens_rate = 0.0 if held else schedule.lens_rate(t, switch)
+        moves_poses, moves_lenses = pose_rate > 0, lens_rate > 0
+        batch = self.sampler.draw(self.rays, schedule.blur(t, switch, self.sampler.long_side), self.draws)
+        matrices, lenses = poses.matrices(), self.lenses.intrinsics
+        if not moves_poses:
+            matrices = matrices.detach()
+        if moves_lenses:
+            matrices, lenses = self.lenses.with_gradient(matrices)
+        in_cam = viewing_directions(self.directions, lenses, batch.image, batch.xy)
+        origin, direction = cast_rays(matrices, batch.image, in_cam)
+        rays = renderer.over_background(origin, direction, batch.trained, jitter=True)
+        marching = self.marching(schedule.interval(t, switch))
+        rendering = self.field.render(rays, marching, schedule.position_gradient(t, switch))
+        colour = exposure.shown(rendering, batch.image)
+        weight, of_camera = batch.weight, self.camera_errors.weights
+        if of_camera is not None and self.method.weights:
+            weight = weight * of_camera[batch.image]
+        forgiven = exposure.forgiven(colour, batch.target)
+        loss = (self.method.loss(forgiven, batch.target) * weight[:, None]).mean()
+        loss.backward()
+        self.field.step(rates)
+        exposure.step(rates.networks)
+        if moves_poses:
+            mobility = self.mobility[0 if switch is None else 1]
+            poses.step(pose_rate, mobility, field_rate=rates.networks)
+            if moves_lenses:
+                poses.dolly(self.lenses.step(lens_rate, focal=schedule.focal_moves(switch)))
+        shown = colour.detach().clamp(max=1)
+        self.camera_errors.add(batch.image, shown, batch.target, rendering.opacity.detach(), batch.weight)
+        error = ((shown - batch.sharp) ** 2 * batch.weight[:, None])[: batch.trained].mean()
+        # A pose that is not finite sees nothing, so the loss stays finite.
+        return loss.detach() + poses.zero_if_finite(), error, rendering.samples
 
     def pose_rate(self) -> float:
         """Learning rate of the poses at this step."""

@@ -110,13 +110,10 @@ class Exposure:
             return
         self.log_gain.grad += self._numbers.exposure_prior / len(self.log_gain) * self.log_gain
         self._adam.step(self._numbers.exposure_rate * rate)
-        self.forget_gradients()
+        self._adam.zero_grad()
         mean = (self.log_gain * self._training).sum(0) / self._training.sum()
         most = math.log(self._numbers.exposure_most)
         self.log_gain.sub_(mean).clamp_(-most, most)
-
-    def forget_gradients(self) -> None:
-        self._adam.zero_grad()
 
     @torch.no_grad()
     def forget(self, camera: int) -> None:

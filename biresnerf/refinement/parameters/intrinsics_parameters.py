@@ -178,16 +178,12 @@ class IntrinsicsParameters:
         if self.increments.grad is not None:
             self.increments.grad += 2 * self.precision * before * self.free
         self._adam.step(rate)
-        self.forget_gradients()
-        if not focal:
-            with torch.no_grad():
-                self.increments[:, FOCAL] = before[:, FOCAL]
-        return self._moved(before)
-
-    @torch.no_grad()
-    def _moved(self, before: Tensor) -> Tensor:
+        self._adam.zero_grad()
         self._present = None
-        moved = ((self.increments - before) * self.free)[:, FOCAL][self.of_image]
+        with torch.no_grad():
+            if not focal:
+                self.increments[:, FOCAL] = before[:, FOCAL]
+            moved = ((self.increments - before) * self.free)[:, FOCAL][self.of_image]
         return moved if self.dollies else torch.zeros_like(moved)
 
     @torch.no_grad()
@@ -221,9 +217,6 @@ class IntrinsicsParameters:
         other = copy(self)
         other.increments = increments.to(self.increments)
         return other
-
-    def forget_gradients(self) -> None:
-        self._adam.zero_grad()
 
     @property
     def refined_parts(self) -> tuple[RefinedPart, ...]:

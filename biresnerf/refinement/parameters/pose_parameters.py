@@ -38,10 +38,8 @@ class PoseParameters:
         double_step: bool = False,
         body: Tensor | None = None,
     ) -> None:
-        count = len(unit_from_cam) if body is None else int(body.max()) + 1
-        # None where every camera is its own body.
-        self.body = body.to(device) if body is not None and count < len(body) else None
-        self._row = torch.arange(count, device=device) if self.body is None else self.body
+        self.body = (torch.arange(len(unit_from_cam)) if body is None else body).to(device)
+        count = int(self.body.max()) + 1
         self.length, self._length = length, torch.full((1,), length, device=device)
         self.start = unit_from_cam[:, :3].to(torch.float32).to(device)
         self.rotation = torch.zeros(count, 3, device=device, requires_grad=True)
@@ -56,23 +54,19 @@ class PoseParameters:
         """unit_from_cam [n, 3, 4], differentiable."""
         rotation, translation, device = self.rotation, self.translation, self.start.device
         if device.type == "cpu":
-            found: Tensor = MovedPoses.apply(rotation, translation, self._row, self.length, self.start)
+            found: Tensor = MovedPoses.apply(rotation, translation, self.body, self.length, self.start)
             return found
         if kernels := camera_kernels(device):
-            return kernels.moved_poses(rotation, translation, self._row, self._length, self.start)
+            return kernels.moved_poses(rotation, translation, self.body, self._length, self.start)
         return self.defined_matrices()
 
     def defined_matrices(self) -> Tensor:
         """The same by torch's operations, on any device."""
-        rotation, translation = self.rotation, self.translation
-        if self.body is not None:
-            rotation, translation = rotation[self.body], translation[self.body]
+        rotation, translation = self.rotation[self.body], self.translation[self.body]
         return moved_poses(rotation, translation * self.length, self.start)
 
     def members(self, camera: int) -> list[int]:
         """The cameras of one camera's body, itself included."""
-        if self.body is None:
-            return [camera]
         return torch.nonzero(self.body == self.body[camera])[:, 0].tolist()
 
     @torch.no_grad()
@@ -94,13 +88,11 @@ class PoseParameters:
         if self._second is not None and field_rate > 0:
             self._second.step(field_rate)
         if mobility is not None:
-            if self.body is not None:
-                least = torch.ones_like(self.rotation[:, 0])
-                mobility = least.scatter_reduce(0, self.body, mobility, "amin")
+            mobility = torch.ones_like(self.rotation[:, 0]).scatter_reduce(0, self.body, mobility, "amin")
             with torch.no_grad():
                 for parameter, kept in before:
                     parameter.copy_(torch.lerp(kept, parameter, mobility[:, None]))
-        self.forget_gradients()
+        self._adam.zero_grad()
 
     @torch.no_grad()
     def dolly(self, log_focal: Tensor) -> None:
@@ -125,7 +117,7 @@ class PoseParameters:
         """Restart one camera, with its body, at another pose [3, 4] and without momentum."""
         with torch.no_grad():
             self._carry_body(camera, unit_from_cam)
-            row = camera if self.body is None else int(self.body[camera])
+            row = int(self.body[camera])
             for parameter in (self.rotation, self.translation):
                 parameter[row] = 0
             for adam in self._adams().values():
@@ -153,9 +145,6 @@ class PoseParameters:
     def zero_if_finite(self) -> Tensor:
         """Zero; not a number where some increment is not finite. Does not wait for the device."""
         return 0 * (self.rotation.detach() + self.translation.detach()).sum()
-
-    def forget_gradients(self) -> None:
-        self._adam.zero_grad()
 
     def _tensors(self) -> dict[str, Tensor]:
         return {

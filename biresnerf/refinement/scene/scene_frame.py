@@ -119,6 +119,10 @@ def scene_frame(
     if reach is not None:
         half = min(half, numbers.content_margin * reach)
     unit_from_world = Similarity(1 / half, np.eye(3), -centre / half)
+    near = 0.0
+    if images.background is None:
+        intrinsics, rigs = Intrinsics.from_cameras(images.cameras), poses.reshape(-1, len(images), 4, 4)
+        near = min(nearest_shared(rig, intrinsics, distance, numbers) for rig in rigs)
     return SceneFrame(
         unit_from_world=unit_from_world,
         unbounded=images.background is None,
@@ -126,11 +130,5 @@ def scene_frame(
         pixel=_pixel_slope(images) * distance / half,
         far=numbers.far_boxes if images.background is None else 4 * distance / half + 4,
         background=images.background,
-        near=_near(poses, images, distance, numbers) if images.background is None else 0.0,
+        near=near,
     )
-
-
-def _near(poses: np.ndarray, images: ImageSet, distance: float, numbers: FrameNumbers) -> float:
-    intrinsics = Intrinsics.from_cameras(images.cameras)
-    rigs = poses.reshape(-1, len(images), 4, 4)
-    return min(nearest_shared(rig, intrinsics, distance, numbers) for rig in rigs)

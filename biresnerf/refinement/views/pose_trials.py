@@ -66,7 +66,6 @@ class PoseTrials:
         recipe: Recipe,
         steps: int,
         should_stop: Callable[[], bool],
-        sampler: PhotoSampler | None = None,
     ) -> None:
         self.images, self.unseen = images, list(unseen)
         self.frame = scene_frame(np.concatenate(list(rigs)), images, recipe.method.scene)
@@ -76,7 +75,7 @@ class PoseTrials:
         # the same poses differ by 0.25 dB from seed to seed (lego at 100 px, 200 steps), so by 0.04.
         self._recipe = recipe.apart(self.steps, (self.steps, self.steps), recipe.method.views.trial_samples)
         self._should_stop = should_stop
-        self._sampler = sampler or PhotoSampler(images, self.unseen, recipe.device, recipe.method.by_detail)
+        self._sampler = PhotoSampler(images, self.unseen, recipe.device, recipe.method.by_detail)
 
     def begin(
         self,

@@ -6,9 +6,9 @@ import torch
 
 from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam, project
 from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS, Camera
-from biresnerf.refinement.adjustment import reference
 from biresnerf.refinement.adjustment.ideal import ideal_cameras
 from biresnerf.refinement.adjustment.lens.corrected_camera import corrected_camera
+from tests.refinement.adjustment import reference
 
 CAMERAS = {
     "SIMPLE_PINHOLE": (500.0, 200.0, 150.0),

@@ -9,11 +9,11 @@ import torch
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.camera.camera_models import Camera
-from biresnerf.refinement.adjustment import reference
 from biresnerf.refinement.adjustment.adjustment import adjust_poses, misfit
-from biresnerf.refinement.adjustment.evidence import Evidence, NoiseLevels, PosePrior
+from biresnerf.refinement.adjustment.evidence import Evidence, PosePrior
 from biresnerf.refinement.adjustment.lens.lenses import LENS, Lenses, slopes_seen
 from biresnerf.refinement.numbers.finish import EvidenceNumbers
+from tests.refinement.adjustment import reference
 from tests.refinement.adjustment.rig import FOCAL, SIZE, disturbed, observed, ring, rotation_errors_deg
 
 
@@ -142,7 +142,7 @@ def test_poor_evidence_ends_in_finite_lenses(rng, kind, deviation):
 def test_left_out_tracks_tell_the_right_lens_from_a_wrong_one(rng):
     truth, evidence = scene(rng, lens(10, focal=0.97))
     right = Lenses(np.zeros(10, np.int64), np.array([[np.log(0.97), *(0.0,) * 7]]), np.zeros((1, LENS)))
-    noise = NoiseLevels(track_px=0.3)
+    noise = 0.3
     assert (misfit(truth, replace(evidence, lenses=right), noise) < misfit(truth, evidence, noise)).all()
 
 

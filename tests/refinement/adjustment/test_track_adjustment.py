@@ -8,12 +8,12 @@ from scipy.optimize import least_squares
 
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.similarity import Similarity
-from biresnerf.refinement.adjustment import reference
 from biresnerf.refinement.adjustment.adjustment import adjust_poses, misfit
 from biresnerf.refinement.adjustment.cameras import Cameras
-from biresnerf.refinement.adjustment.evidence import Evidence, NoiseLevels, PosePrior
+from biresnerf.refinement.adjustment.evidence import Evidence, PosePrior
 from biresnerf.refinement.adjustment.lens.lenses import Lenses
 from biresnerf.refinement.adjustment.track_term import ROBUST_SCALE, TrackTerm
+from tests.refinement.adjustment import reference
 from tests.refinement.adjustment.rig import disturbed, observed, pinholes, ring, rotation_errors_deg
 
 # Two lenses: log focal length, k1, k2, principal point, p1, p2, aspect.
@@ -150,14 +150,14 @@ def test_the_result_is_that_of_scipy(rng):
 def test_left_out_tracks_tell_better_poses_from_worse(rng):
     truth, evidence = scene(rng, noise_px=0.3)
     worse = disturbed(truth, rng, 0.002, 0.005)
-    noise = NoiseLevels(track_px=0.3)
+    noise = 0.3
     assert (misfit(truth, evidence, noise) < misfit(worse, evidence, noise)).all()
 
 
 def test_left_out_tracks_do_not_mind_the_frame(rng):
     truth, evidence = scene(rng, noise_px=0.3)
     carried = Similarity(3.0, ring(1, rng)[0, :3, :3], np.array([5.0, 1.0, 2.0])).apply_to_poses(truth)
-    noise = NoiseLevels(track_px=0.3)
+    noise = 0.3
     np.testing.assert_allclose(misfit(carried, evidence, noise), misfit(truth, evidence, noise), rtol=1e-5)
 
 

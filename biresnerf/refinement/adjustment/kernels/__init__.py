@@ -1,1 +1,1 @@
-"""The adjustment's inner loops, compiled. `reference` defines what they compute; nothing here decides anything."""
+"""The adjustment's inner loops, compiled. They are defined in plain torch beside their tests, and decide nothing."""

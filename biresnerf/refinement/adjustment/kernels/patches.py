@@ -1,6 +1,6 @@
 """Patches of photos compared with other photos: residuals, and the cameras' normal equations without the depths.
 
-The definitions are in `biresnerf.refinement.adjustment.reference`. Cameras and their increments are those of `tracks`.
+The definitions are in `tests.refinement.adjustment.reference`. Cameras and their increments are those of `tracks`.
 Photos are cubic B-splines: coefficients [total_px, channels], photo after photo, row by row, with `frames` [n, 3]:
 first row of the coefficients, width and height. A patch i has rays [k, 3] (z = 1) in its host's axes, and inverse
 depths [k] times its one unknown, the scale s[i]; its comparisons lie one after the other. Rays are those of the lens as

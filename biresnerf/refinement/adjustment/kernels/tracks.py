@@ -1,6 +1,6 @@
 """Points seen in several photos: reprojection residuals, and the cameras' normal equations without the points.
 
-The definitions are in `biresnerf.refinement.adjustment.reference`. A point's observations lie one after the other.
+The definitions are in `tests.refinement.adjustment.reference`. A point's observations lie one after the other.
 Cameras are R = rotation [n, 3, 3] (world from cam), c = centre [n, 3]; lenses are those of `lens`. An increment of a
 camera is a rotation vector w and a shift s, both in the world's axes: exp(w) R and c + s. What is
 known of points before is (x - place)^T known (x - place), zero for most: known [p, 3, 3], place [p, 3].

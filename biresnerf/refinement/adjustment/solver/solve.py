@@ -85,7 +85,8 @@ def minimise(cameras: Cameras, terms: Sequence[Term], prior: Prior) -> Cameras:
 
 def _descend(cameras: Cameras, terms: Sequence[Term], prior: Prior) -> Cameras:
     """Steps at fixed noise levels."""
-    damping, cost = DAMPING, total_cost(cameras, terms, prior)
+    damping = DAMPING
+    cost = prior.cost(cameras) + sum(term.cost(cameras, term.unknowns) for term in terms)
     for _ in range(STEPS):
         linear = [term.linearise(cameras, damping) for term in terms]
         better = None
@@ -150,11 +151,6 @@ def _damped(system: Blocks, right: Array, free: NDArray[np.bool_], damping: floa
         return None
     # What is not positive definite will be, damped more.
     return solution(system.with_diagonal(damping * diagonal), -right, free)
-
-
-def total_cost(cameras: Cameras, terms: Sequence[Term], prior: Prior) -> float:
-    """The robust cost of all terms and of leaving the prior."""
-    return prior.cost(cameras) + sum(term.cost(cameras, term.unknowns) for term in terms)
 
 
 def normal_equations(cameras: Cameras, linear: Sequence[Linearised], prior: Prior) -> tuple[Blocks, Array]:
