@@ -22,9 +22,8 @@ from biresnerf.geometry.pose_error import pose_error
 from biresnerf.geometry.similarity import align_robust
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.refinement.optimise.methods import Recipe, find_method
-from biresnerf.refinement.views.compare_rigs import Rig, compare_on_unseen_views
+from biresnerf.refinement.views.compare_rigs import Rig, compare_on_unseen_views, moved_px
 from biresnerf.refinement.views.held_out_views import held_out_views
-from biresnerf.refinement.views.motion import moved_px
 
 
 def poses_of(text: str, dataset: Dataset) -> np.ndarray:
@@ -65,6 +64,7 @@ def main() -> None:
         ).resolved("cpu")
         found = compare_on_unseen_views(
             (before, after), images, held_out_views(len(dataset), "auto", find_method("biresnerf").views),
+            np.ones(len(dataset), np.bool_),
             Recipe.of(options, torch.device("cpu"), use_threads(0)), lambda: False,
         )  # fmt: skip
         if found is None:

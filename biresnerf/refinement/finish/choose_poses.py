@@ -66,11 +66,13 @@ def choose_poses(
     heeding = most_heeded(results)
     if heeding is not None and not _believes_control(heeding, split.fitted):
         logger.info("control points are not believed: too many contradict the photos")
-        split, prior, results = _adjusted(gathered.without_control(), refined, joint, cameras, announce)
+        gathered = replace(gathered, fitted=replace(gathered.fitted, control=None))
+        split, prior, results = _adjusted(gathered, refined, joint, cameras, announce)
     noise_px = results["adjusted-tracks"].known_noise_px if "adjusted-tracks" in results else 1.0
     if noise_px > _most_noise_px(split.fitted):
         logger.info("tracks say nothing: their noise is %.1f px", noise_px)
-        split = split.without_tracks()
+        fitted, left_out = (replace(each, tracks=None) for each in (split.fitted, split.left_out))
+        split = replace(split, fitted=fitted, left_out=left_out, tracks=None)
         results = {name: each for name, each in results.items() if name == "adjusted-patches"}
     given = input_accuracy(scene.dataset, most_heeded(results), split.fitted, options)
     if given is not None and given.tells(prior):

@@ -40,13 +40,6 @@ class SplitEvidence:
     tracks: Tracks | None
     placed: NDArray[np.bool_]
 
-    def without_control(self) -> SplitEvidence:
-        return replace(self, fitted=replace(self.fitted, control=None))
-
-    def without_tracks(self) -> SplitEvidence:
-        fitted, left_out = (replace(each, tracks=None) for each in (self.fitted, self.left_out))
-        return SplitEvidence(fitted, left_out, None, self.placed)
-
 
 def gather_evidence(
     scene: Scene,

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from biresnerf.arrays import Array
 from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.geometry.similarity import Similarity
@@ -24,14 +26,6 @@ class Fit:
     world_from_cam: Array
     evidence: Evidence
     patch_noise: float
-
-    def errors_of(
-        self, world_from_cam: Array, world_from_unit: Similarity, bodies: RigidBodies
-    ) -> ExpectedErrors:
-        """What the evidence says of the errors of poses [n, 4, 4] in the input's frame, in that frame."""
-        in_unit = world_from_unit.inverse().apply_to_poses(world_from_cam)
-        found = expected_errors(in_unit, self.world_from_cam, self.evidence, self.patch_noise, bodies)
-        return found.carried(world_from_unit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +56,17 @@ class Finish:
     def heeds_photos(self) -> bool:
         """Whether patches of the photos were to be trusted."""
         return self.fit is not None and self.fit.evidence.patches is not None
+
+    def errors_of(
+        self, world_from_cam: Array, world_from_unit: Similarity, bodies: RigidBodies
+    ) -> ExpectedErrors | None:
+        """What the evidence says of the errors of poses [n, 4, 4] in the input's frame, in that frame; or None."""
+        fit = self.fit
+        if fit is None or not np.isfinite(world_from_cam).all():
+            return None
+        in_unit = world_from_unit.inverse().apply_to_poses(world_from_cam)
+        found = expected_errors(in_unit, fit.world_from_cam, fit.evidence, fit.patch_noise, bodies)
+        return found.carried(world_from_unit)
 
     def refused(self) -> Finish:
         """The same where the chosen poses are not taken, and the evidence that prefers them is not believed."""

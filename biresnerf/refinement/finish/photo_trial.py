@@ -13,8 +13,7 @@ from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.parameters.joint_parameters import JointParameters
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.run_state import RunState
-from biresnerf.refinement.views.compare_rigs import Effort, Rig, compare_placed
-from biresnerf.refinement.views.motion import moved_px
+from biresnerf.refinement.views.compare_rigs import Effort, Rig, compare_on_unseen_views, moved_px
 
 logger = logging.getLogger(__name__)
 
@@ -54,9 +53,9 @@ def photos_object(scene: Scene, joint: JointParameters, recipe: Recipe, run: Run
     )  # known by now, if not before
     forecast = run.monitor.forecast
     with run.timed("adjusting", "checking", work):
-        found = compare_placed(
-            present, other, scene, recipe, ~scene.start.guessed, run.monitor.should_stop,
-            forecast.advance, Effort(PHOTO_TRIALS, rounds_most=1, looks=(1.0,)),
+        found = compare_on_unseen_views(
+            (present, other), scene.images, scene.held_out, ~scene.start.guessed, recipe,
+            run.monitor.should_stop, forecast.advance, Effort(PHOTO_TRIALS, rounds_most=1, looks=(1.0,)),
         )  # fmt: skip
         forecast.took(found.work if found else 0.0)
     if found is None:

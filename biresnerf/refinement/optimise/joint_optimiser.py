@@ -18,7 +18,7 @@ from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.refinement.optimise.async_metrics import AsyncMetrics, StepResult
 from biresnerf.refinement.optimise.camera_errors import CameraErrors
 from biresnerf.refinement.optimise.methods import Recipe
-from biresnerf.refinement.optimise.optimiser_state import Part, StepState, load_state_of, state_of
+from biresnerf.refinement.optimise.optimiser_state import Part, StepState
 from biresnerf.refinement.optimise.photo_sampler import PhotoSampler
 from biresnerf.refinement.optimise.pose_hypotheses import photo_distances
 from biresnerf.refinement.optimise.renderer import Renderer, cast_rays, viewing_directions
@@ -67,7 +67,18 @@ class JointOptimiser:
         self.method = recipe.method
         self.field = self.method.build_field(options, frame, device, threads)
         self.lenses = lenses or IntrinsicsParameters.held(images.cameras, device)
-        self.poses = poses if poses is not None else self._pose_parameters(torch.from_numpy(unit_from_cam))
+        self.poses = (
+            poses
+            if poses is not None
+            else PoseParameters(
+                torch.from_numpy(unit_from_cam),
+                frame.distance / RIG_DISTANCE,
+                device,
+                betas=self.method.pose_betas,
+                double_step=options.double_pose_step,
+                body=torch.from_numpy(self.bodies.of),
+            )
+        )
         self.schedule = self.method.scheduled(options, frame)
         self._images = images
         self.sampler = sampler or PhotoSampler(images, held_out, device, self.method.by_detail)
@@ -118,16 +129,6 @@ class JointOptimiser:
     def photo_distances(self) -> NDArray[np.float32]:
         """How unlike the photos are, see `photo_distances`; computed when a lost camera first needs it."""
         return photo_distances(self._images)
-
-    def _pose_parameters(self, unit_from_cam: Tensor) -> PoseParameters:
-        return PoseParameters(
-            unit_from_cam,
-            self.frame.distance / RIG_DISTANCE,
-            self.device,
-            betas=self.method.pose_betas,
-            double_step=self.options.double_pose_step,
-            body=torch.from_numpy(self.bodies.of),
-        )
 
     def replace_pose(self, camera: int, unit_from_cam: Tensor) -> None:
         """Restart one camera at another pose [3, 4], as free as any and with no history."""
@@ -260,7 +261,9 @@ class JointOptimiser:
 
     def state(self) -> dict[str, Tensor]:
         """All tensors of the run (shared, not copied)."""
-        return {"generator": self.generator.get_state(), **state_of(self._parts())}
+        parts = {name: part.state() for name, part in self._parts().items()}
+        named = {f"{name}.{key}": tensor for name, part in parts.items() for key, tensor in part.items()}
+        return {"generator": self.generator.get_state(), **named}
 
     def _parts(self) -> dict[str, Part]:
         return {
@@ -287,7 +290,9 @@ class JointOptimiser:
     def load_state(self, tensors: dict[str, Tensor], numbers: StepState) -> None:
         """Restore what `state` and `step_state` returned; the next step is then the one that would have come."""
         self.generator.set_state(tensors["generator"])
-        load_state_of(self._parts(), tensors)
+        for name, part in self._parts().items():
+            head = f"{name}."
+            part.load_state({k.removeprefix(head): v for k, v in tensors.items() if k.startswith(head)})
         self.step_index, self.switch, self.rays = numbers.step_index, numbers.switch, numbers.rays
         self.poses_held, self.batch_share = numbers.poses_held, numbers.batch_share
         if numbers.planned_steps != self.options.steps:

@@ -13,8 +13,6 @@ from torch import Tensor
 from biresnerf.data.show.history import History
 from biresnerf.forecast.run_forecast import Phase
 from biresnerf.progress import Monitor, Progress
-from biresnerf.refinement.lost.lost_cameras import RepairState
-from biresnerf.refinement.optimise.optimiser_state import StepState
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.checkpoint import (
     Checkpoint,
@@ -23,7 +21,6 @@ from biresnerf.refinement.stages.checkpoint import (
     save_checkpoint,
     track_tensors,
 )
-from biresnerf.refinement.stages.stability import DetectorState
 
 
 class RunState:
@@ -100,29 +97,11 @@ class RunState:
         self.monitor.forecast.advance(share)
         self.monitor.report(Progress(stage="evaluating", step=step, steps_total=steps_total, message=message))
 
-    def save(
-        self,
-        tensors: dict[str, Tensor],
-        *,
-        ends_stage_1: bool,
-        optimiser: StepState,
-        detector: DetectorState,
-        repair: RepairState,
-        block_errors: tuple[float, ...],
-    ) -> None:
+    def save(self, tensors: dict[str, Tensor], **steps: object) -> None:
         """Write a checkpoint with these fields of `Checkpoint`, which say how far the steps are."""
-        checkpoint = Checkpoint(
-            ends_stage_1=ends_stage_1,
-            origin=self._origin,
-            start=self._scene.start,
-            record=self.record,
-            optimiser=optimiser,
-            detector=detector,
-            repair=repair,
-            block_errors=block_errors,
-            tensors={**track_tensors(self._scene.tracks), **tensors},
-        )
-        save_checkpoint(self._folder, checkpoint)
+        own = {"origin": self._origin, "start": self._scene.start, "record": self.record}
+        tensors = {**track_tensors(self._scene.tracks), **tensors}
+        save_checkpoint(self._folder, Checkpoint.model_validate({**own, **steps, "tensors": tensors}))
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Continue the record of a checkpoint; one that ends stage 1 is of another run."""

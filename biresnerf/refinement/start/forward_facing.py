@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.photos.images import ImageSet
-from biresnerf.errors import InputError, Interrupted
+from biresnerf.errors import InputError
 from biresnerf.geometry.rigid import motion_of
 from biresnerf.geometry.similarity import nearest_rotation
 from biresnerf.judging.compare import is_better
@@ -23,7 +23,7 @@ from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.methods import Recipe
 from biresnerf.refinement.scene.scene_frame import scene_frame
 from biresnerf.refinement.views.evaluation import score_views
-from biresnerf.refinement.views.pose_trials import trial_views
+from biresnerf.refinement.views.pose_trials import Trial, trial_views
 
 logger = logging.getLogger(__name__)
 
@@ -53,10 +53,7 @@ def find_forward_facing(
         short = recipe.apart(steps, (steps // 4, steps), numbers.facing_samples)
         poses = frame.unit_from_world.apply_to_poses(world_from_cam)
         optimiser = JointOptimiser(images, frame, poses, short, unseen)
-        for _ in range(steps):
-            if should_stop():
-                raise Interrupted("stopped while poses were looked for without features")
-            optimiser.step()
+        Trial(optimiser, images, unseen, steps, should_stop).train(1.0)
         psnr = float(np.mean([score.psnr for score in score_views(optimiser.renderer, images, unseen)]))
         return frame.unit_from_world.inverse().apply_to_poses(optimiser.poses.poses().numpy()), psnr
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torch import Tensor
-
 from biresnerf.arrays import Array
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.points.located_points import metres_from_world
@@ -36,24 +34,17 @@ class RefinedPoses:
     @classmethod
     def now(cls, dataset: Dataset, joint: JointParameters) -> RefinedPoses:
         """Those of this moment."""
-        return cls._of(dataset, joint, joint.unit_from_cam, joint.lenses)
-
-    @classmethod
-    def at(
-        cls, dataset: Dataset, joint: JointParameters, unit_from_cam: Array, increments: Tensor
-    ) -> RefinedPoses:
-        """Those of an earlier moment: poses [n, 4, 4] in the unit frame, and increments of the lenses."""
-        return cls._of(dataset, joint, unit_from_cam, joint.lenses.at(increments))
+        return cls.at(dataset, joint, joint.unit_from_cam, joint.lenses)
 
     def input_from_unit(self, frame: SceneFrame) -> Similarity:
         """From the unit frame that the optimisation is in."""
         return self.input_from_optimised @ frame.unit_from_world.inverse()
 
     @classmethod
-    def _of(
+    def at(
         cls, dataset: Dataset, joint: JointParameters, unit_from_cam: Array, lenses: IntrinsicsParameters
     ) -> RefinedPoses:
-        """The optimisation leaves frame and scale free.
+        """Those of any moment, [n, 4, 4] in the unit frame. The optimisation leaves frame and scale free.
 
         The similarity that fits the optimised poses to the given ones best fixes them; it is robust to lost cameras
         unless the method says otherwise. Fixed cameras and rigs leave less free. Where nobody gave poses, measured

@@ -22,7 +22,7 @@ import torch
 from biresnerf.data.photos.alike.turning_object import IN_THE_WAY, still_surroundings
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.seeding.initial_poses import InitialPoses
-from biresnerf.errors import InputError, Interrupted
+from biresnerf.errors import InputError
 from biresnerf.geometry.level_ring import order_on_ring
 from biresnerf.geometry.turntable import Ring
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
@@ -31,7 +31,7 @@ from biresnerf.refinement.optimise.photo_sampler import PhotoSampler
 from biresnerf.refinement.parameters.ring_parameters import RingParameters
 from biresnerf.refinement.scene.scene_frame import scene_frame
 from biresnerf.refinement.start.ring_order import RingOrder, axis_in_photos, find_ring, thumbnails
-from biresnerf.refinement.views.pose_trials import score_unseen, trial_views
+from biresnerf.refinement.views.pose_trials import Trial, score_unseen, trial_views
 from biresnerf.report import TrialReport
 
 logger = logging.getLogger(__name__)
@@ -83,10 +83,7 @@ class RingTrials:
         optimiser = JointOptimiser(
             self.images, self.frame, poses, short, self.unseen, sampler=self._sampler, poses=moving
         )
-        for _ in range(steps):
-            if self._should_stop():
-                raise Interrupted("stopped while rings of cameras were tried")
-            optimiser.step()
+        Trial(optimiser, self.images, self.unseen, steps, self._should_stop).train(1.0)
         unseen = score_unseen(optimiser.renderer, self.images, self.unseen, self._stride)
         return Tried(moving.now().detached(), float(unseen.psnr.mean()))
 

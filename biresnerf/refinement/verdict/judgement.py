@@ -14,7 +14,7 @@ from biresnerf.arrays import Array
 from biresnerf.data.model.dataset import GUESSES, Dataset
 from biresnerf.data.workload import JUDGING
 from biresnerf.geometry.focus import focus_point, rms_spread
-from biresnerf.geometry.pose_error import rotation_between_deg
+from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.refinement.adjustment.cameras import Cameras
 from biresnerf.refinement.adjustment.measured_terms import control_believed, measured_misfits
 from biresnerf.refinement.finish.expected_errors import ExpectedErrors
@@ -25,7 +25,6 @@ from biresnerf.refinement.numbers.finish import EvidenceNumbers
 from biresnerf.refinement.optimise.methods import Method, Recipe
 from biresnerf.refinement.optimise.photo_sampler import PhotoSampler
 from biresnerf.refinement.optimise.renderer import Renderer
-from biresnerf.refinement.parameters.joint_parameters import JointParameters
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.run_state import RunState
 from biresnerf.refinement.start.refined_poses import RefinedPoses
@@ -43,10 +42,10 @@ from biresnerf.refinement.views.compare_rigs import (
     Effort,
     HeldOutComparison,
     Rig,
-    compare_placed,
+    compare_on_unseen_views,
     may_be_blur,
+    moved_px,
 )
-from biresnerf.refinement.views.motion import moved_px
 from biresnerf.report import EpipolarEvidence, Finding, Verdict
 
 logger = logging.getLogger(__name__)
@@ -116,7 +115,10 @@ def judge_poses(
     found = compare_without_training(scene, refined, lost, method)
     # Only then it matters what the evidence determines: to know it, a matrix of all cameras is inverted.
     asked = matches_are_better(found.findings) and method.uncertainty
-    errors = _errors(refined, joint, finish) if asked else None
+    errors = None
+    if asked:
+        input_from_unit = refined.input_from_unit(joint.frame)
+        errors = finish.errors_of(refined.world_from_cam, input_from_unit, joint.bodies)
     told = replace(found.findings, determined=_determined(errors, finish))
     heldout: HeldOutComparison | None = None
     work = 0.0
@@ -124,9 +126,9 @@ def judge_poses(
         effort = Effort(pictured=True, favoured=told.by_matches, moved_px=told.moved_px)
         rounds = max(_rounds(run, 1, most), 1)
         for each in (effort, replace(effort, times=numbers.longer, looks=(1.0,))):
-            heldout = compare_placed(
-                found.before, found.after, scene, recipe, found.placed | (not told.grounded),
-                run.monitor.should_stop, report, replace(each, rounds_most=rounds),
+            heldout = compare_on_unseen_views(
+                (found.before, found.after), scene.images, scene.held_out, found.placed | (not told.grounded),
+                recipe, run.monitor.should_stop, report, replace(each, rounds_most=rounds),
             )  # fmt: skip
             work += heldout.work if heldout else 0.0
             blur = each is effort and heldout is not None and may_be_blur(heldout.evidence, effort, numbers)
@@ -146,14 +148,6 @@ def _determined(errors: ExpectedErrors | None, finish: Finish) -> float | None:
     if finish.fit is None and finish.candidates:
         return 0.0
     return None if errors is None else float(errors.known.mean())
-
-
-def _errors(refined: RefinedPoses, joint: JointParameters, finish: Finish) -> ExpectedErrors | None:
-    """What the evidence says of the errors of refined poses; None where it says nothing."""
-    poses = refined.world_from_cam
-    if finish.fit is None or not np.isfinite(poses).all():
-        return None
-    return finish.fit.errors_of(poses, refined.input_from_unit(joint.frame), joint.bodies)
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +174,8 @@ def compare_without_training(scene: Scene, refined: RefinedPoses, lost: int, met
     rows = range(len(dataset))
     before = Rig(dataset.world_from_cam, tuple(dataset.camera_of(i) for i in rows))
     after = Rig(refined.world_from_cam, tuple(refined.dataset.camera_of(i) for i in rows))
-    turned, shifted = motion(before.world_from_cam, after.world_from_cam)
+    apart = camera_errors(after.world_from_cam, before.world_from_cam)
+    turned, shifted = apart.rotation_deg, apart.centre
     spread = rms_spread(before.world_from_cam[:, :3, 3])
     grounded = sum(frame.pose_source not in GUESSED for frame in dataset.frames) > len(dataset) / 2
     failed = failed_checks(after.world_from_cam, lost, numbers)
@@ -243,12 +238,6 @@ def _by_positions(
         return "better" if better else "worse"
     stated = new.control is not None or (new.positions is not None and new.positions.stated)
     return "same" if stated else None
-
-
-def motion(before: Array, after: Array) -> tuple[Array, Array]:
-    """Rotation (deg) and distance of the centres [n] between poses [n, 4, 4] of the same cameras."""
-    turned = rotation_between_deg(before, after)
-    return turned, np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
 
 
 def _source_of_poses(dataset: Dataset) -> Literal["given", "seeded", "mixed"]:

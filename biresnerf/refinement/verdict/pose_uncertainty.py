@@ -40,8 +40,8 @@ def pose_uncertainty(
     wrong = np.zeros(len(dataset), np.bool_) if judgement is None else judgement.contradicted
     if judgement is not None and judgement.verdict.returned == "input":
         poses, found, wrong = dataset.world_from_cam, None, judgement.contradicted_before
-    if found is None and finish.fit is not None and np.isfinite(poses).all():
-        found = finish.fit.errors_of(poses, refined.input_from_unit(joint.frame), joint.bodies)
+    if found is None:
+        found = finish.errors_of(poses, refined.input_from_unit(joint.frame), joint.bodies)
     reasons = [
         FIXED if joint.bodies.fixed[i]
         else MATCHES_CONTRADICT if wrong[i]

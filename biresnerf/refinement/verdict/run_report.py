@@ -13,6 +13,7 @@ from biresnerf.data.photos.photo_folders import few_names
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.field.backends import gpu_faults
+from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.judging.compare import TRIAL, is_better
 from biresnerf.refinement.finish.given_poses import accuracy_report, accuracy_warnings
 from biresnerf.refinement.finish.outcome import Finish
@@ -29,7 +30,7 @@ from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.stages.checkpoint import RunRecord
 from biresnerf.refinement.start.matches_explained import explained_from_one_place
 from biresnerf.refinement.start.refined_poses import RefinedPoses
-from biresnerf.refinement.verdict.judgement import Judgement, motion
+from biresnerf.refinement.verdict.judgement import Judgement
 from biresnerf.refinement.verdict.pose_uncertainty import FIXED
 from biresnerf.refinement.verdict.so_far import SoFar
 from biresnerf.refinement.views.evaluation import ViewScore
@@ -241,7 +242,7 @@ def _image_reports(
     found: Findings,
 ) -> tuple[ImageReport, ...]:
     exposures = joint.exposure.gains()
-    turn, shift = motion(scene.dataset.world_from_cam, refined)
+    moved = camera_errors(refined, scene.dataset.world_from_cam)
     scored = {score.image: score for score in found.scores}
     return tuple(
         ImageReport(
@@ -249,8 +250,8 @@ def _image_reports(
             pose_source=scene.start.sources[i],
             held_out=i in scene.held_out,
             fixed=bool(joint.bodies.fixed[i]),
-            moved_deg=float(turn[i]),
-            moved_units=float(shift[i]),
+            moved_deg=float(moved.rotation_deg[i]),
+            moved_units=float(moved.centre[i]),
             uncertainty=found.uncertainty[i] if found.uncertainty else None,
             repaired=i in repaired,
             exposure=None if exposures is None else tuple(exposures[i].tolist()),

@@ -73,8 +73,8 @@ def poses_so_far(
         return SoFar(now, verdict)
     if best is None:
         return SoFar(now, verdict)
-    increments = torch.from_numpy(best.increments)
-    return SoFar(RefinedPoses.at(scene.dataset, joint, best.unit_from_cam, increments), best.verdict)
+    lenses = joint.lenses.at(torch.from_numpy(best.increments))
+    return SoFar(RefinedPoses.at(scene.dataset, joint, best.unit_from_cam, lenses), best.verdict)
 
 
 def _verdict(

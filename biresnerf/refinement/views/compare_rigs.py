@@ -6,16 +6,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from biresnerf.arrays import Array
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.data.workload import LOOKS, picture_share
+from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam, project
 from biresnerf.geometry.camera.camera_models import Camera
+from biresnerf.geometry.focus import focus_point
 from biresnerf.judging.compare import UNSEEN_PSNR, UNSEEN_SSIM, compare, paired
 from biresnerf.refinement.numbers.choosing import VerdictNumbers
 from biresnerf.refinement.optimise.methods import Recipe
-from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.views.held_out_views import unseen_rounds
 from biresnerf.refinement.views.image_metrics import shift_px
 from biresnerf.refinement.views.pose_trials import PoseTrials, Trial, TrialScores, joined
@@ -24,6 +26,7 @@ from biresnerf.report import Finding, HeldOutEvidence
 BeforeAfter = dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]]
 
 SHOWN = 4  # held-out views that are rendered with either rig, to be looked at
+MOTION_GRID = 5  # points across and down
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +46,33 @@ class Rig:
             camera.resized(small.width, small.height)
             for camera, small in zip(self.cameras, images.cameras, strict=True)
         )
+
+
+def moved_px(before: Rig, after: Rig, images: ImageSet) -> float:
+    """How far the scene moves in the image (px, working size) between two rigs in one frame: median over cameras.
+
+    Looked at are points of a grid over each image, as far as the point that the rig `before` looks at; each camera
+    counts with their mean, and no point with more than the image's long side.
+    """
+    n = len(images)
+    old, new = (Intrinsics.from_cameras(rig.lenses(images)) for rig in (before, after))
+    focus = focus_point(before.world_from_cam)
+    towards = (focus.point - before.world_from_cam[:, :3, 3]) * before.world_from_cam[:, :3, 2]
+    depth = np.where(towards.sum(1) > 0, towards.sum(1), focus.mean_distance)
+    steps = (torch.arange(MOTION_GRID, dtype=torch.float64) + 0.5) / MOTION_GRID
+    share = torch.cartesian_prod(steps, steps).repeat(n, 1)
+    index = torch.arange(n).repeat_interleave(MOTION_GRID**2)
+    xy = share * torch.stack([old.width, old.height], 1)[index]
+    rays = directions_in_cam(old, index, xy).numpy()
+    i = index.numpy()
+    in_cam = rays * depth[i][:, None]
+    world = (
+        np.einsum("mij,mj->mi", before.world_from_cam[i, :3, :3], in_cam) + before.world_from_cam[i, :3, 3]
+    )
+    seen = np.einsum("mji,mj->mi", after.world_from_cam[i, :3, :3], world - after.world_from_cam[i, :3, 3])
+    moved = (project(new, index, torch.from_numpy(seen)) - xy).norm(dim=1).numpy().reshape(n, -1)
+    most = np.maximum(images.widths, images.heights)[:, None].astype(np.float64)
+    return float(np.median(np.fmin(moved, most).mean(1)))
 
 
 @dataclass(frozen=True)
@@ -87,6 +117,7 @@ def compare_on_unseen_views(
     pair: tuple[Rig, Rig],
     images: ImageSet,
     held_out: Sequence[int],
+    placed: NDArray[np.bool_],
     recipe: Recipe,
     should_stop: Callable[[], bool],
     report: Callable[[float], None] = lambda _share: None,
@@ -98,12 +129,20 @@ def compare_on_unseen_views(
 
     Args:
         held_out: views that the refinement never trained on; others join them where these are few.
+        placed: images [n] that take part: others would spoil the fields of both rigs.
         report: called with the share of work done, if the present round decides.
 
     Raises:
         Interrupted: ``should_stop`` returned true.
     """
-    numbers, steps = recipe.method.verdict, effort.times * recipe.options.trial_steps
+    numbers, steps, rows = (
+        recipe.method.verdict,
+        effort.times * recipe.options.trial_steps,
+        np.flatnonzero(placed),
+    )
+    if not placed.all():
+        images, pair = images.of(rows), (pair[0].of(rows), pair[1].of(rows))
+        held_out = np.flatnonzero(np.isin(rows, held_out)).tolist()
     rounds = unseen_rounds(len(images), held_out, recipe.method.views)[: effort.rounds_most]
     if steps == 0 or not rounds[0]:
         return None
@@ -133,9 +172,11 @@ def compare_on_unseen_views(
             )  # fmt: skip
             decided = _decided(old, new, missed_px, numbers.early if look < 1 else 1, effort, numbers)
             if pictured and (decided or look == 1):
-                renders = _pictures(running, [view for view in views if view in held_out][:SHOWN], enough)
+                renders = _pictures(
+                    running, [view for view in views if view in held_out][:SHOWN], enough, rows
+                )
             did = work + sum(trial.work for trial in running)
-            found = HeldOutComparison(seen, old, new, evidence, did, renders)
+            found = HeldOutComparison(rows[seen].tolist(), old, new, evidence, did, renders)
             if decided:
                 return found
         earlier.append(scores)
@@ -143,11 +184,13 @@ def compare_on_unseen_views(
     return found
 
 
-def _pictures(pair: Sequence[Trial], views: Sequence[int], share: float) -> BeforeAfter:
-    """These views as both fields see them after so much of their training, or more."""
+def _pictures(
+    pair: Sequence[Trial], views: Sequence[int], share: float, rows: NDArray[np.int64]
+) -> BeforeAfter:
+    """These views, by their rows, as both fields see them after so much of their training, or more."""
     for trial in pair:
         trial.train(share)
-    return {view: (pair[0].render(view), pair[1].render(view)) for view in views}
+    return {int(rows[view]): (pair[0].render(view), pair[1].render(view)) for view in views}
 
 
 def _missed_px(scores: TrialScores, images: ImageSet, views: Sequence[int]) -> float:
@@ -194,26 +237,3 @@ def _decided(
     return photos_tell(missed_px, effort.moved_px, numbers) and (
         says("better", times) or says("worse", times)
     )
-
-
-def compare_placed(
-    before: Rig,
-    after: Rig,
-    scene: Scene,
-    recipe: Recipe,
-    placed: NDArray[np.bool_],
-    should_stop: Callable[[], bool],
-    report: Callable[[float], None] = lambda _share: None,
-    effort: Effort = Effort(),
-) -> HeldOutComparison | None:
-    """`compare_on_unseen_views` of the images placed [n] alone: others would spoil the fields of both rigs."""
-    rows = np.flatnonzero(placed)
-    images = scene.images if placed.all() else scene.images.of(rows)
-    held_out = np.flatnonzero(np.isin(rows, scene.held_out)).tolist()
-    found = compare_on_unseen_views(
-        (before.of(rows), after.of(rows)), images, held_out, recipe, should_stop, report, effort
-    )
-    if found is None:
-        return None
-    renders = {int(rows[view]): pair for view, pair in found.renders.items()}
-    return replace(found, views=rows[found.views].tolist(), renders=renders)

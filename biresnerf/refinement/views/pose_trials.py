@@ -119,7 +119,7 @@ class Trial:
         """
         while self.optimiser.step_index < round(share * self.steps):
             if self.should_stop():
-                raise Interrupted("stopped while sets of poses were compared")
+                raise Interrupted("stopped while sets of poses were tried")
             self.optimiser.step()
 
     @property
@@ -136,14 +136,8 @@ class Trial:
 
     def render(self, view: int) -> NDArray[np.float32]:
         """A view whole [h, w, 3], to be looked at."""
-        matrices = self.optimiser.poses.matrices().detach()
-        return render_view(
-            self.optimiser.renderer,
-            matrices[view],
-            view,
-            as_photo=True,
-            coarser=self.optimiser.method.views.coarser,
-        ).colour
+        pose, coarser = self.optimiser.poses.matrices()[view].detach(), self.optimiser.method.views.coarser
+        return render_view(self.optimiser.renderer, pose, view, as_photo=True, coarser=coarser).colour
 
 
 def score_unseen(

@@ -288,7 +288,7 @@ def test_no_field_is_trained_where_cameras_moved_by_less_than_photos_show(tmp_pa
     forecast = run.forecast
     monkeypatch.setattr(
         photo_trial,
-        "compare_placed",
+        "compare_on_unseen_views",
         lambda *given: trained.append((given[-1].looks, forecast.left["checking"])),
     )
     work = photo_check(run.optimiser.options, kind=run.optimiser.schedule.kind)

@@ -166,7 +166,7 @@ def test_poses_that_stayed_are_unchanged(scene):
 
 
 def test_matches_alone_tell_good_poses_from_bad_ones(scene, noisy, monkeypatch):
-    monkeypatch.setattr(f"{judge_poses.__module__}.compare_placed", lambda *_, **__: None)
+    monkeypatch.setattr(f"{judge_poses.__module__}.compare_on_unseen_views", lambda *_, **__: None)
     truth, matches = scene[0].world_from_cam, true_matches(scene[0])
     better, worse = judged(scene, noisy, truth, matches), judged(scene, truth, noisy, matches)
     assert (better.verdict.verdict, worse.verdict.verdict) == ("improved", "kept_input")
@@ -226,7 +226,7 @@ def test_trainings_are_the_same_again(scene):
 
 
 def test_a_camera_that_its_own_matches_contradict_is_named(scene, monkeypatch):
-    monkeypatch.setattr(f"{judge_poses.__module__}.compare_placed", lambda *_, **__: None)
+    monkeypatch.setattr(f"{judge_poses.__module__}.compare_on_unseen_views", lambda *_, **__: None)
     truth, refined = scene[0].world_from_cam, scene[0].world_from_cam.copy()
     refined[5] = refined[6]
     found = judged(scene, truth, refined, true_matches(scene[0]))

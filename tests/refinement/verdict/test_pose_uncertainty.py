@@ -89,7 +89,7 @@ def test_a_pose_that_its_own_matches_contradict_is_not_known(tmp_path, rng):
 
 
 def test_matches_speak_for_poses_only_where_they_determine_most_of_them(tmp_path, rng, monkeypatch):
-    monkeypatch.setattr(f"{judge_poses.__module__}.compare_placed", lambda *_, **__: None)
+    monkeypatch.setattr(f"{judge_poses.__module__}.compare_on_unseen_views", lambda *_, **__: None)
     run, _ = noisy_run(tmp_path, rng)
     finish = adjusted(run)
     evidence = finish.fit.evidence

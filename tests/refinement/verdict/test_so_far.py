@@ -31,7 +31,7 @@ def no_training(monkeypatch):
     def refuse(*_, **__):
         raise AssertionError("a field is trained")
 
-    monkeypatch.setattr(judgement, "compare_placed", refuse)
+    monkeypatch.setattr(judgement, "compare_on_unseen_views", refuse)
 
 
 def so_far(run: TinyRun) -> SoFar:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from biresnerf.refinement.views.compare_rigs import Rig
-from biresnerf.refinement.views.motion import moved_px
+from biresnerf.refinement.views.compare_rigs import Rig, moved_px
 from tests.refinement.tiny_scene import tiny_set
 
 VIEWS = 14
