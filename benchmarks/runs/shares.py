@@ -37,8 +37,9 @@ OUTER = [
     (TwoStages, "run_stage_1", "stage 1"),
     (TwoStages, "run_stage_2", "stage 2"),
     (rounds, "adjust_cameras", "adjusting"),
+    (pipeline, "fit_held_out_poses", "evaluating"),
     (pipeline, "evaluate", "evaluating"),
-    (pipeline, "judge", "verdict"),
+    (pipeline, "judge_poses", "verdict"),
     (pipeline, "write_result", "writing"),
 ]
 INNER = [(adjust_cameras, "photos_object", CHECKING)]
