@@ -1,4 +1,4 @@
-"""Exponential of rotations and rigid motions on torch tensors, finite everywhere with gradient, and logarithm.
+"""Exponential of rotations and rigid motions on torch tensors, finite everywhere with gradient.
 
 A rotation vector is axis times angle (rad). Rotation and translation are always two arguments, never packed.
 The exponential takes its coefficients and their derivatives from the Stumpff functions, see `_Stumpff`.
@@ -13,15 +13,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from biresnerf.geometry.rigid import rotation_vectors
-
 # Terms of the Stumpff functions' series: below one radian the first one left out is under 1e-17.
 _SERIES_TERMS = 9
 
 
 def hat(vector: Tensor) -> Tensor:
     """The matrix [..., 3, 3] with ``hat(v) @ x == cross(v, x)``, of vectors [..., 3]."""
-    _require(vector, (3,), "vector")
+    _require(vector, "vector")
     flat = vector @ _generators(vector.dtype, vector.device)
     return flat.reshape(*flat.shape[:-1], 3, 3)
 
@@ -32,7 +30,7 @@ def so3_exp(rotvec: Tensor) -> Tensor:
     Raises:
         ValueError: if the last axis is not 3 or the tensor is not of a float type.
     """
-    _require(rotvec, (3,), "rotvec")
+    _require(rotvec, "rotvec")
     sine_term, cosine_term, _ = _exp_coefficients(rotvec)
     skew = hat(rotvec)
     return _identity_like(skew) + sine_term * skew + cosine_term * (skew @ skew)
@@ -52,8 +50,8 @@ def se3_exp(rotvec: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
     Raises:
         ValueError: if a last axis is not 3 or a tensor is not of a float type.
     """
-    _require(rotvec, (3,), "rotvec")
-    _require(velocity, (3,), "velocity")
+    _require(rotvec, "rotvec")
+    _require(velocity, "velocity")
     sine_term, cosine_term, cubic_term = _exp_coefficients(rotvec)
     skew = hat(rotvec)
     square = skew @ skew
@@ -68,16 +66,6 @@ def moved_poses(rotvec: Tensor, velocity: Tensor, pose: Tensor) -> Tensor:
     turn, shift = se3_exp(rotvec, velocity)
     centre = (turn @ pose[:, :, 3:])[:, :, 0] + shift
     return torch.cat([turn @ pose[:, :, :3], centre[:, :, None]], 2)
-
-
-def so3_log(rotation: Tensor) -> Tensor:
-    """Rotation vectors [..., 3] of rotation matrices [..., 3, 3], without gradient: see `rotation_vectors`.
-
-    Raises:
-        ValueError: if the last axes are not 3 x 3 or the tensor is not of a float type.
-    """
-    _require(rotation, (3, 3), "rotation")
-    return torch.from_numpy(rotation_vectors(rotation.detach().cpu().numpy())).to(rotation)
 
 
 def _exp_coefficients(rotvec: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -153,10 +141,8 @@ def _identity_like(matrix: Tensor) -> Tensor:
     return torch.eye(3, dtype=matrix.dtype, device=matrix.device).expand_as(matrix)
 
 
-def _require(tensor: Tensor, tail: tuple[int, ...], name: str) -> None:
-    if tuple(tensor.shape[-len(tail) :]) != tail:
-        raise ValueError(
-            f"{name} must have shape [..., {', '.join(map(str, tail))}], got {tuple(tensor.shape)}"
-        )
+def _require(tensor: Tensor, name: str) -> None:
+    if tensor.shape[-1:] != (3,):
+        raise ValueError(f"{name} must have shape [..., 3], got {tuple(tensor.shape)}")
     if not tensor.is_floating_point():
         raise ValueError(f"{name} must be of a float type, got {tensor.dtype}")

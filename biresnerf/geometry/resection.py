@@ -10,11 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from biresnerf.arrays import Array
-from biresnerf.geometry.lie import hat
 from biresnerf.geometry.rigid import motion_of, rotation_of
 from biresnerf.geometry.similarity import nearest_rotation
 
@@ -162,7 +160,7 @@ def _refined(points: Array, rays: Array, rotation: Array, centre: Array, bound: 
         residual = seen - rays
         weight = 1 / (1 + (residual**2).sum(1) / bound**2) ** 2
         flat = (np.eye(3) - seen[:, :, None] * seen[:, None, :]) / length[:, None, None]
-        jacobian = np.concatenate([flat @ hat(torch.from_numpy(towards)).numpy(), -flat], axis=2)
+        jacobian = np.concatenate([flat @ np.cross(np.eye(3), towards[:, None]), -flat], axis=2)
         system = np.einsum("m,mij,mik->jk", weight, jacobian, jacobian)
         right = np.einsum("m,mij,mi->j", weight, jacobian, residual)
         try:

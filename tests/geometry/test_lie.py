@@ -1,4 +1,4 @@
-"""Exponential and logarithm against scipy, matrix exponentials and finite differences."""
+"""Exponential, and the logarithm of `rigid`, against scipy, matrix exponentials and finite differences."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from biresnerf.geometry.lie import hat, se3_exp, so3_exp, so3_log
+from biresnerf.geometry.lie import hat, se3_exp, so3_exp
+from biresnerf.geometry.rigid import rotation_vectors
 
 # (type, what a rotation matrix's entries may be off by)
 TYPES = [(torch.float64, 1e-14), (torch.float32, 1e-6)]
@@ -87,14 +88,15 @@ def test_hat_is_the_cross_product():
 @given(unit_vectors, st.floats(0.0, np.pi - 1e-6))
 def test_log_inverts_exp(axis, angle):
     rotvec = torch.tensor(axis * angle, dtype=torch.float64)
-    torch.testing.assert_close(so3_log(so3_exp(rotvec)), rotvec, atol=1e-9 * max(angle, 1e-6), rtol=1e-9)
+    back = torch.from_numpy(rotation_vectors(so3_exp(rotvec).numpy()))
+    torch.testing.assert_close(back, rotvec, atol=1e-9 * max(angle, 1e-6), rtol=1e-9)
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), TYPES)
 @pytest.mark.parametrize("below", [1e-3, 1e-5, 1e-7, 1e-9, 0.0])
 def test_exp_inverts_log_near_pi(below, dtype, tolerance):
     rotation = so3_exp(torch.tensor(axes() * (np.pi - below), dtype=dtype))
-    rotvec = so3_log(rotation)
+    rotvec = torch.from_numpy(rotation_vectors(rotation.numpy())).to(dtype)
     assert (rotvec.norm(dim=-1) <= torch.pi + 10 * tolerance).all()
     torch.testing.assert_close(so3_exp(rotvec), rotation, atol=20 * tolerance, rtol=0)
 
@@ -105,10 +107,9 @@ def test_value_and_gradient_are_finite_everywhere(angle, dtype, tolerance):
     rotvec = torch.tensor(axes() * angle, dtype=dtype, requires_grad=True)
     velocity = torch.ones_like(rotvec, requires_grad=True)
     rotation, translation = se3_exp(rotvec, velocity)
-    back = so3_log(rotation)
     weights = torch.randn(3, 3, dtype=dtype, generator=torch.Generator().manual_seed(1))
     ((rotation * weights).sum() + (translation * weights[0]).sum()).backward()
-    for tensor in (rotation, translation, back, rotvec.grad, velocity.grad):
+    for tensor in (rotation, translation, rotvec.grad, velocity.grad):
         assert torch.isfinite(tensor).all()
     identity = torch.eye(3, dtype=dtype).expand_as(rotation)
     torch.testing.assert_close(rotation @ rotation.mT, identity, atol=20 * tolerance, rtol=0)
@@ -136,9 +137,7 @@ def test_a_batch_equals_its_elements_and_may_be_empty():
             one = se3_exp(rotvec[i, j], velocity[i, j])
             torch.testing.assert_close(rotation[i, j], one[0])
             torch.testing.assert_close(translation[i, j], one[1])
-            torch.testing.assert_close(so3_log(rotation)[i, j], so3_log(rotation[i, j]))
     assert so3_exp(torch.zeros(0, 3)).shape == (0, 3, 3)
-    assert so3_log(torch.zeros(0, 3, 3)).shape == (0, 3)
 
 
 def test_wrong_shapes_and_types_are_refused():
@@ -146,5 +145,3 @@ def test_wrong_shapes_and_types_are_refused():
         so3_exp(torch.zeros(4))
     with pytest.raises(ValueError, match="float type"):
         so3_exp(torch.zeros(3, dtype=torch.int64))
-    with pytest.raises(ValueError, match="rotation must have shape"):
-        so3_log(torch.zeros(4, 3))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from biresnerf.arrays import Array
 from biresnerf.geometry.camera.camera import Intrinsics
-from biresnerf.geometry.lie import so3_exp, so3_log
+from biresnerf.geometry.rigid import rotation_of, rotation_vectors
 from biresnerf.geometry.similarity import nearest_rotation
 from biresnerf.refinement.adjustment.lens.lenses import (
     ASPECT,
@@ -73,15 +73,14 @@ class Cameras:
     def moved(self, motion: Array) -> Cameras:
         """After an increment [6n + 8g]: of each camera a rotation vector and a shift, both in the world's axes."""
         poses, lenses = self.split(motion)
-        turn = so3_exp(torch.from_numpy(np.ascontiguousarray(poses[:, :3]))).numpy()
+        turn = rotation_of(poses[:, :3])
         return replace(
             self, rotation=turn @ self.rotation, centre=self.centre + poses[:, 3:], lens=self.lens + lenses
         )
 
     def apart(self, other: Cameras) -> Array:
         """The increment [6n + 8g] that leads from `other` to these cameras."""
-        turn = np.ascontiguousarray(self.rotation @ other.rotation.transpose(0, 2, 1))
-        turned = so3_log(torch.from_numpy(turn)).numpy()
+        turned = rotation_vectors(self.rotation @ other.rotation.transpose(0, 2, 1))
         poses = np.concatenate([turned, self.centre - other.centre], axis=1)
         return np.concatenate([poses.reshape(-1), (self.lens - other.lens).reshape(-1)])
 

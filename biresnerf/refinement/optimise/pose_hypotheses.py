@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from biresnerf.arrays import Array
 from biresnerf.data.photos.area_resize import area_resize
 from biresnerf.data.photos.images import ImageSet
-from biresnerf.geometry.lie import so3_exp
+from biresnerf.geometry.rigid import motion_of, rotation_of
 from biresnerf.geometry.similarity import align_robust
 from biresnerf.refinement.numbers.lost import LostNumbers
 
@@ -107,6 +106,4 @@ def _facing_centre(pose: Array) -> Array:
 
 def _turn(rotvec: Array) -> Array:
     """Rotations about the origin as matrices [..., 4, 4] of rotation vectors [..., 3]."""
-    matrix = np.tile(np.eye(4), (*rotvec.shape[:-1], 1, 1))
-    matrix[..., :3, :3] = so3_exp(torch.from_numpy(rotvec)).numpy()
-    return matrix
+    return motion_of(rotation_of(rotvec))

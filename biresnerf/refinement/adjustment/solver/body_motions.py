@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from biresnerf.arrays import Array
-from biresnerf.geometry.lie import so3_exp
+from biresnerf.geometry.rigid import rotation_of
 from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.refinement.adjustment.cameras import POSE, Cameras
 from biresnerf.refinement.adjustment.solver.blocks import Blocks
@@ -88,7 +87,7 @@ class BodyMoves:
 
 def rigid_motion(cameras: Cameras, bodies: RigidBodies, motion: Array) -> Array:
     """The increment [n, 6] of the cameras that keeps bodies rigid, from one [n, 6] that does so to first order."""
-    turn = so3_exp(torch.from_numpy(np.ascontiguousarray(motion[:, :3]))).numpy()
+    turn = rotation_of(motion[:, :3])
     away = cameras.centre - _middles(cameras, bodies)
     first_order = np.cross(motion[:, :3], away)
     exact = np.einsum("nab,nb->na", turn, away) - away
