@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-import tempfile
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Literal
@@ -16,7 +14,7 @@ from biresnerf.data.formats.registry import ALL_CODECS
 from biresnerf.data.formats.transforms.write_intrinsics import lens_values
 from biresnerf.data.formats.transforms.write_transforms import transforms_notes
 from biresnerf.data.formats.write_each import write_each
-from biresnerf.data.model.atomic_file import write_json
+from biresnerf.data.model.atomic_file import whole_folder, write_json
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.refined_set import RefinedSet, refined_set
 from biresnerf.data.photos.masks import mask_beside
@@ -74,7 +72,7 @@ def convert(
     if photos != "none" and any(map(_wants_flat, names)):
         flat = _in_images_folder(refined)
         _refuse_two_names(refined, flat, names)
-    with _whole_folder(folder) as staging:
+    with whole_folder(folder) as staging:
         context = WriteContext(chosen, bounds)
         writing = write_each(refined, names, lambda name: _write(flat, refined, name, staging, context))
         writing.raise_first()
@@ -93,20 +91,6 @@ def convert(
 def _write(flat: RefinedSet, refined: RefinedSet, name: str, folder: Path, context: WriteContext) -> None:
     codec = ALL_CODECS[name]
     codec.write_set(flat if _wants_flat(name) else refined, folder / codec.format.in_set, context)
-
-
-@contextmanager
-def _whole_folder(folder: Path) -> Iterator[Path]:
-    """A folder to write to, which takes the place of ``folder`` (new, or empty) at the end; gone after a failure."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    staging = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    try:
-        yield staging
-        staging.chmod(0o755)
-        os.replace(staging, folder)
-    except BaseException:
-        shutil.rmtree(staging, ignore_errors=True)
-        raise
 
 
 def _notes(dataset: Dataset, names: Sequence[str]) -> tuple[str, ...]:

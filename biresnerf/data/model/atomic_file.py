@@ -1,13 +1,14 @@
-"""Files that appear whole or not at all."""
+"""Files and folders that appear whole or not at all."""
 
 from __future__ import annotations
 
 import json
 import os
-import tempfile
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from secrets import token_hex
 from typing import Any
 
 
@@ -16,18 +17,27 @@ def whole_file(path: Path) -> Iterator[Path]:
     """A path beside ``path`` to write to; on success it takes ``path``'s place, else it is removed."""
     path.parent.mkdir(parents=True, exist_ok=True)
     # The suffix is kept at the end: image and video writers choose their format by it.
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
-    os.close(handle)
-    temporary = Path(name)
+    temporary = path.with_name(f".{path.stem}.{token_hex(6)}{path.suffix}")
+    temporary.touch(exist_ok=False)  # unlike mkstemp's, open to the group that the folder is shared with
     try:
         yield temporary
-        # mkstemp's 0600 would hide results from the group that the folder is shared with.
-        temporary.chmod(0o666 & ~_umask())
         with temporary.open("rb") as written:
             os.fsync(written.fileno())
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def whole_folder(folder: Path) -> Iterator[Path]:
+    """A folder beside ``folder`` (new, or empty) to write to, which takes its place at the end; else it goes."""
+    staging = folder.with_name(f".{folder.name}.{token_hex(6)}")
+    staging.mkdir(parents=True)
+    try:
+        yield staging
+        staging.replace(folder)
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -39,14 +49,3 @@ def write_text(path: Path, text: str) -> None:
 def write_json(path: Path, document: Any, indent: int = 2) -> None:
     """Write a JSON document, whole or not at all. Raises ValueError for NaN and infinity."""
     write_text(path, json.dumps(document, indent=indent, ensure_ascii=False, allow_nan=False))
-
-
-def _umask() -> int:
-    """The process's umask, read without changing it (Linux), else the usual one."""
-    try:
-        for line in Path("/proc/self/status").read_text().splitlines():
-            if line.startswith("Umask:"):
-                return int(line.split()[1], 8)
-    except OSError:
-        pass
-    return 0o022

@@ -156,22 +156,17 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return result
 
 
-def first_non_finite(value: Any, path: str = "") -> str | None:
-    """The path (``frames[3].transform_matrix[0][1]``) of the first NaN or infinite number, or None."""
-    found = _first_non_finite(value)
-    return None if found is None else f"{path}{found}".removeprefix(".")
-
-
-def _first_non_finite(value: Any) -> str | None:
+def first_non_finite(value: Any) -> str | None:
+    """The path (``.frames[3].transform_matrix[0][1]``) of the first NaN or infinite number, or None."""
     if isinstance(value, float):
         return None if math.isfinite(value) else ""
     if isinstance(value, dict):
         for key, item in value.items():
-            if (found := _first_non_finite(item)) is not None:
+            if (found := first_non_finite(item)) is not None:
                 return f".{key}{found}"
     elif isinstance(value, list):
         for index, item in enumerate(value):
-            if (found := _first_non_finite(item)) is not None:
+            if (found := first_non_finite(item)) is not None:
                 return f"[{index}]{found}"
     return None
 
@@ -229,9 +224,9 @@ def read_json(path: Path, *, apart: str | None = None) -> Any:
     return document
 
 
-def read_json_object(path: Path, *, apart: str | None = None) -> dict[str, Any]:
+def read_json_object(path: Path) -> dict[str, Any]:
     """As `read_json`, for a file that must hold an object. Raises InputError ``pose_file_invalid`` for another."""
-    document = read_json(path, apart=apart)
+    document = read_json(path)
     if not isinstance(document, dict):
         what = f"holds a {type(document).__name__}, not an object with `frames`."
         raise invalid_file(
@@ -242,45 +237,28 @@ def read_json_object(path: Path, *, apart: str | None = None) -> dict[str, Any]:
 
 def refuse_non_finite(value: Any, file: str, place: str = "") -> None:
     """Raises InputError ``pose_not_finite`` for NaN and infinite numbers in ``value``, which lies at ``place``."""
-    found = first_non_finite(value, place)
+    found = first_non_finite(value)
     if found is not None:
         raise InputError(
             "pose_not_finite",
             "NaN or an infinite number.",
-            where=f"{file} {found[:300]}",
+            where=f"{file} {(place + found).removeprefix('.')[:300]}",
             hint="Remove the frame, or its transform_matrix, or export it again.",
         )
 
 
-def read_model(model: type[Model], path: Path, *, code: str, hint: str) -> Model:
-    """The object in the JSON file ``path``, checked against ``model``.
+def checked(model: type[Model], value: object, where: str, hint: str, code: str | None = None) -> Model:
+    """A document, or the part of one that is at ``where``, as ``model``.
 
     Raises:
-        InputError: ``code`` with ``hint`` and the first wrong field, or a code of `read_json_object`.
-    """
-    try:
-        return model.model_validate(read_json_object(path))
-    except ValidationError as error:
-        raise first_problem(error, path, code=code, hint=hint) from None
-
-
-def checked(model: type[Model], value: object, where: str, hint: str) -> Model:
-    """A part of a document, at ``where``, as ``model``.
-
-    Raises:
-        InputError: ``pose_not_finite`` for a number that is not finite, else ``pose_file_invalid``.
+        InputError: ``code`` with the first wrong field; where left out ``pose_not_finite`` for a number that is not
+            finite, else ``pose_file_invalid``.
     """
     try:
         return model.model_validate(value)
     except ValidationError as error:
         first = error.errors()[0]
-        code = "pose_not_finite" if first["type"] == "finite_number" else "pose_file_invalid"
+        not_finite = first["type"] == "finite_number"
+        code = code or ("pose_not_finite" if not_finite else "pose_file_invalid")
         field = ".".join(str(part) for part in first["loc"])
         raise InputError(code, f"{first['msg']}.", where=f"{where} {field}".rstrip(), hint=hint) from None
-
-
-def first_problem(error: ValidationError, path: Path, *, code: str, hint: str) -> InputError:
-    """The error for the first wrong field of the JSON file ``path``."""
-    first = error.errors()[0]
-    field = ".".join(str(part) for part in first["loc"])
-    return InputError(code, f"{first['msg']}.", where=f"{path.name} {field}".rstrip(), hint=hint)

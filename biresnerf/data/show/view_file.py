@@ -8,7 +8,7 @@ from typing import Literal
 from pydantic import Field
 
 from biresnerf.data.model.atomic_file import write_text
-from biresnerf.data.model.untrusted_file import read_model
+from biresnerf.data.model.untrusted_file import checked, read_json_object
 from biresnerf.frozen_model import FrozenModel
 
 VIEW, THUMBNAIL = "view.json", "thumbnail.jpg"
@@ -92,9 +92,5 @@ def read_view_file(folder: Path) -> ViewFile:
     Raises:
         InputError: ``view_file_invalid``, or a code of `read_json_object`.
     """
-    return read_model(
-        ViewFile,
-        folder / VIEW,
-        code="view_file_invalid",
-        hint="Leave the files of a result together, as they were written.",
-    )
+    hint = "Leave the files of a result together, as they were written."
+    return checked(ViewFile, read_json_object(folder / VIEW), VIEW, hint, "view_file_invalid")

@@ -101,7 +101,7 @@ def test_a_file_beyond_the_limit_is_not_even_read(file):
 
 def test_the_first_number_that_is_not_finite_is_named_by_its_path():
     document = {"a": 1, "frames": [{"m": [[0.0, 1.0]]}, {"m": [[0.0, math.nan]]}]}
-    assert first_non_finite(document) == "frames[1].m[0][1]"
+    assert first_non_finite(document) == ".frames[1].m[0][1]"
     assert first_non_finite({"a": [1.0, "NaN"]}) is None
 
 
@@ -131,7 +131,7 @@ def test_a_long_key_above_many_numbers_is_written_out_for_the_one_that_is_not_fi
     numbers = [0.5] * 1000
     assert first_non_finite({Key("k"): numbers}) is None
     assert Key.written == 0
-    assert first_non_finite({Key("k"): [*numbers, math.nan]}) == "k[1000]"
+    assert first_non_finite({Key("k"): [*numbers, math.nan]}) == ".k[1000]"
     assert Key.written == 1
 
 

@@ -15,7 +15,7 @@ from pydantic import Field
 from biresnerf.data.formats.codec import Codec
 from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.refined_set import PointsSource, RefinedSet
-from biresnerf.data.model.untrusted_file import read_model
+from biresnerf.data.model.untrusted_file import checked, read_json_object
 from biresnerf.frozen_model import FrozenModel
 from biresnerf.geometry.body_offset import BodyOffset
 from biresnerf.geometry.camera.camera_models import Camera
@@ -129,12 +129,8 @@ def read_poses_json(path: Path) -> PosesDocument:
     Raises:
         InputError: ``pose_file_invalid``, or a code of `read_json_object`.
     """
-    return read_model(
-        PosesDocument,
-        path,
-        code="pose_file_invalid",
-        hint="Give the poses.json of a finished result, as it was written.",
-    )
+    hint = "Give the poses.json of a finished result, as it was written."
+    return checked(PosesDocument, read_json_object(path), path.name, hint, "pose_file_invalid")
 
 
 def body_offset_of(document: PosesDocument) -> BodyOffset | None:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import tempfile
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from biresnerf.data.model.atomic_file import whole_folder
 from biresnerf.data.photos.video.choose_frames import SIDE, FrameWatch, choose_frames
 from biresnerf.data.photos.video.ffmpeg_frames import DEMUXERS, FrameStream
 from biresnerf.errors import InputError
@@ -84,17 +84,16 @@ def _kept(folder: Path, video: Path, share: int | None) -> list[Path] | None:
 
 def _written(folder: Path, video: Path, count: int, reading: VideoReading) -> list[Path]:
     times, sharpness, chosen = _choice(video, count, reading)
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        staging = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    except OSError as error:
-        raise InputError(
-            "video_frames_not_written",
-            f"the frames of a video are written beside it, and this cannot be written to: {error.strerror}.",
-            where=str(folder.parent),
-            hint="Copy the video to a folder of your own, and give that.",
-        ) from None
-    try:
+    with ExitStack() as stack:
+        try:
+            staging = stack.enter_context(whole_folder(folder))
+        except OSError as error:
+            raise InputError(
+                "video_frames_not_written",
+                f"the frames of a video are written beside it, and this cannot be written to: {error.strerror}.",
+                where=str(folder.parent),
+                hint="Copy the video to a folder of your own, and give that.",
+            ) from None
         names = _names([times[index] for index in chosen])
         _write(video, staging, chosen, names, reading)
         listed = [
@@ -103,12 +102,7 @@ def _written(folder: Path, video: Path, count: int, reading: VideoReading) -> li
         ]
         told = {"of": _source(video), "asked": count, "frames": listed}
         (staging / CHOSEN).write_text(json.dumps(told, indent=1), "utf-8")
-        staging.chmod(0o755)
         shutil.rmtree(folder, ignore_errors=True)
-        os.replace(staging, folder)
-    except BaseException:
-        shutil.rmtree(staging, ignore_errors=True)
-        raise
     return [folder / name for name in names]
 
 
