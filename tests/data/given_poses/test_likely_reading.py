@@ -12,8 +12,7 @@ import pytest
 from PIL import Image
 
 from biresnerf.data.formats.read_dataset import read_dataset
-from biresnerf.data.given_poses.constant_turn import best_turn
-from biresnerf.data.given_poses.likely_reading import borne_out, pose_question
+from biresnerf.data.given_poses.likely_reading import best_turn, borne_out, pose_question
 from biresnerf.data.given_poses.matched_details import MatchedPair, matched_pairs, off_by
 from biresnerf.data.given_poses.readings import poses_read_as
 from biresnerf.data.model.dataset import Dataset
