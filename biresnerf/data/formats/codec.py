@@ -36,6 +36,7 @@ class WriteContext:
 # InputError, codes as in docs/input.md.
 Parser: TypeAlias = Callable[[Path, Path], ParsedPoses]
 # The parsed poses, the folder of the images, and the folder that no file may lie outside of.
+# Raises InputError likewise.
 Binder: TypeAlias = Callable[[ParsedPoses, Path, Path | None], Dataset]
 # The set, the file or folder to write, which the format's declaration names, and the context. Raises InputError
 # ``export_not_possible`` where the format cannot hold the set.
@@ -67,6 +68,11 @@ def head_matches(pattern: bytes) -> Callable[[Path], bool]:
 BROWN, FISHEYE = ("k1", "k2", "k3", "p1", "p2"), ("k1", "k2", "k3", "k4")
 _CENTRED_PX = 1e-6
 _PINHOLE_HINT = "Export `pinhole`, which holds undistorted photos with PINHOLE cameras, and files of them."
+
+
+def cannot_hold(where: str, what: str, hint: str = _PINHOLE_HINT) -> InputError:
+    """The error for a set that a format, called so or written to ``where``, cannot hold."""
+    return InputError("export_not_possible", what, where=where, hint=hint)
 
 
 @dataclass(frozen=True)
@@ -110,7 +116,7 @@ class LensLimits:
         """Raises InputError ``export_not_possible`` for the first lens with a problem."""
         for problem in filter(None, map(self.problem, cameras)):
             what = f"{self.program} cannot hold a lens of this set: {problem}."
-            raise InputError("export_not_possible", what, where=where, hint=self.hint)
+            raise cannot_hold(where, what, self.hint)
 
 
 @dataclass(frozen=True)
@@ -151,11 +157,8 @@ class Codec:
         """Write the set. Raises InputError ``export_not_possible`` where the format cannot hold it."""
         holds = self.format.panoramas or "lenses" in self.format.loses
         if not holds and any(camera.panorama for camera in refined.cameras):
-            raise InputError(
-                "export_not_possible",
-                "cannot hold panoramas.",
-                where=path.name,
-                hint="transforms.json and formats without lenses can.",
+            raise cannot_hold(
+                path.name, "cannot hold panoramas.", "transforms.json and formats without lenses can."
             )
         assert self.write is not None, f"{self.format.name} is written"
         self.write(refined, path, context)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
-from biresnerf.data.formats.codec import WriteContext
+from biresnerf.data.formats.codec import WriteContext, cannot_hold
 from biresnerf.data.formats.registry import ALL_CODECS
 from biresnerf.data.formats.transforms.write_intrinsics import lens_values
 from biresnerf.data.formats.transforms.write_transforms import transforms_notes
@@ -146,11 +146,10 @@ def _refuse_two_names(refined: RefinedSet, flat: RefinedSet, names: Sequence[str
         old, new = PurePosixPath(image.file_name), PurePosixPath(moved.file_name)
         found_by_its_name = old.name == new.name and old.parts[0] != IMAGE_FOLDER
         if old != new and not found_by_its_name:
-            raise InputError(
-                "export_not_possible",
+            raise cannot_hold(
+                ", ".join(names),
                 f"{old} must be {new} for one of the formats, and keep its name for another.",
-                where=", ".join(names),
-                hint=f"Convert to {', '.join(filter(_wants_flat, names))} in a folder of its own.",
+                f"Convert to {', '.join(filter(_wants_flat, names))} in a folder of its own.",
             )
 
 

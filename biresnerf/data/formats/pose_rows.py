@@ -145,6 +145,23 @@ def lens_of(full: FullParameters, where: str, size: tuple[int, int]) -> Camera:
     return camera_of_numbers(model, *size, params, where)
 
 
+def lens_of_shares(lens: FullParameters, where: str) -> Callable[[int, int], Camera]:
+    """A lens whose lengths are shares of the picture's longer side, from its centre, at a width and a height.
+
+    Raises:
+        InputError: ``intrinsics_invalid``.
+    """
+
+    def at(width: int, height: int) -> Camera:
+        size = max(width, height)
+        cx, cy = lens.cx * size + width / 2, lens.cy * size + height / 2
+        return lens_of(
+            lens._replace(fx=lens.fx * size, fy=lens.fy * size, cx=cx, cy=cy), where, (width, height)
+        )
+
+    return at
+
+
 def pinhole_of(matrix: NDArray[np.float64], where: str, first_pixel: float) -> Callable[[int, int], Camera]:
     """The pinhole lens of an intrinsic matrix [3, 3] (or [4, 4]) at a width and a height.
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
-from biresnerf.data.formats.codec import WriteContext
+from biresnerf.data.formats.codec import WriteContext, cannot_hold
 from biresnerf.data.formats.colmap.format import COLMAP
 from biresnerf.data.formats.colmap.read_model import read_colmap_model
 from biresnerf.data.formats.registry import ALL_CODECS
@@ -149,11 +149,10 @@ def half_known(offset: BodyOffset) -> list[str]:
 
 
 def _not_of_body(why: str) -> InputError:
-    return InputError(
-        "export_not_possible",
+    return cannot_hold(
+        "poses_of=body",
         f"{why}.",
-        where="poses_of=body",
-        hint="Poses of the body follow where poses.json has body_from_camera, in formats of poses alone, as kitti.",
+        "Poses of the body follow where poses.json has body_from_camera, in formats of poses alone, as kitti.",
     )
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.data.model.untrusted_file import refuse_not_finite
 from biresnerf.errors import InputError
 from biresnerf.geometry.rigid import motion_of
 
@@ -56,13 +57,7 @@ def rigid_matrix(value: Any, where: str) -> tuple[NDArray[np.float64], float]:
             field.
     """
     rows = _numbers(value, where)
-    if not np.isfinite(rows).all():
-        raise InputError(
-            "pose_not_finite",
-            "NaN or an infinite number.",
-            where=where,
-            hint="Remove the frame or export it again.",
-        )
+    refuse_not_finite(rows, where, "Remove the frame or export it again.")
     if len(rows) == 4 and rows[3, 3] > 0.0 and not rows[3, :3].any():
         rows = rows / rows[3, 3]  # homogeneous: any multiple of the matrix is the same motion
     if len(rows) == 4 and not np.allclose(rows[3], [0.0, 0.0, 0.0, 1.0], rtol=0.0, atol=1e-6):

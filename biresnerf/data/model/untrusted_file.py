@@ -66,8 +66,7 @@ def finite_numbers(words: Sequence[str], where: str, hint: str, *counts: int) ->
         values = np.array([float(word) for word in words], dtype=np.float64)
     except ValueError:
         raise invalid_file(where, "holds a word that is not a number.", hint) from None
-    if not np.isfinite(values).all():
-        raise InputError("pose_not_finite", "NaN or an infinite number.", where=where, hint=hint)
+    refuse_not_finite(values, where, hint)
     if counts and len(words) not in counts:
         raise invalid_file(where, f"has {len(words)} numbers, not {' or '.join(map(str, counts))}.", hint)
     return values
@@ -137,6 +136,12 @@ def read_table(
 def invalid_file(where: str, what: str, hint: str) -> InputError:
     """The error for a pose file of which ``what`` is wrong at ``where``."""
     return InputError("pose_file_invalid", what, where=where, hint=hint)
+
+
+def refuse_not_finite(values: NDArray[np.float64], where: str, hint: str) -> None:
+    """Raises InputError ``pose_not_finite`` unless all of ``values``, at ``where``, are finite."""
+    if not np.isfinite(values).all():
+        raise InputError("pose_not_finite", "NaN or an infinite number.", where=where, hint=hint)
 
 
 class _DuplicateKeyError(ValueError):

@@ -12,7 +12,7 @@ import pytest
 
 from biresnerf.data.formats.colmap.write_binary import write_colmap_binary
 from biresnerf.data.formats.read_dataset import read_dataset
-from biresnerf.data.model.part_of_model import without_images
+from biresnerf.data.model.part_of_set import without_images
 from biresnerf.errors import InputError
 from tests.data.formats.random_sets import random_result
 from tests.data.formats.simple import trajectories

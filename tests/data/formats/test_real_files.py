@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from biresnerf.data.formats.photogrammetry.realitycapture_xmp import parse_realitycapture_xmp
+from biresnerf.data.formats.photogrammetry.realitycapture import parse_realitycapture_xmp
 from biresnerf.data.formats.read_dataset import read_dataset, read_poses
 from biresnerf.data.model.dataset import Dataset
 from tests.data.formats.posed_sets import write_plain_photos

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from biresnerf.data.model import colmap_scene as colmap
 from biresnerf.data.model.pose_validation import MAX_COORDINATE, MAX_POINT_COORDINATE
+from biresnerf.data.model.untrusted_file import refuse_not_finite
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import (
     COLMAP_MODELS,
@@ -32,6 +33,11 @@ _UNDISTORT = "Undistort the images with COLMAP's image_undistorter."
 def broken(where: str, what: str, code: str = "pose_file_invalid", hint: str = _HINT) -> InputError:
     """The error for a model of which ``what`` is wrong at ``where``."""
     return InputError(code, f"{what}.", where=where, hint=hint)
+
+
+def unsupported(where: str, what: str, hint: str) -> InputError:
+    """The error for a lens or camera model, at ``where``, that is not read."""
+    return InputError("camera_model_unsupported", what, where=where, hint=hint)
 
 
 def refuse_repeated(table: dict[int, Any], number: int, what: str) -> None:
@@ -73,12 +79,7 @@ def supported_model(name: str, where: str) -> str:
                 "Give the panoramas alone, and their poses are found; or give the poses in a transforms.json with "
                 f'"camera_model": "{PANORAMA}".'
             )
-        raise InputError(
-            "camera_model_unsupported",
-            f"the camera model {name[:40]} is not supported.",
-            where=where,
-            hint=hint,
-        )
+        raise unsupported(where, f"the camera model {name[:40]} is not supported.", hint)
     return name
 
 
@@ -157,8 +158,7 @@ def listed_name(raw: str, where: str) -> str:
 def rigid_pose(numbers: Sequence[float], where: str, hint: str = _HINT) -> colmap.RigidPose:
     """The pose of a quaternion (w, x, y, z) and a translation. Raises InputError unless it is rigid and finite."""
     values = np.array(numbers, dtype=np.float64)
-    if not np.isfinite(values).all():
-        raise broken(where, "NaN or an infinite number in the pose", "pose_not_finite", "Remove the image.")
+    refuse_not_finite(values, where, "Remove the image.")
     length = float(np.linalg.norm(np.clip(values[:4], -9.0, 9.0)))  # a square overflows
     if abs(length - 1.0) > QUAT_LENGTH_ERROR:
         raise broken(where, f"the quaternion has length {length:.3g}, not 1", "pose_not_rotation", hint)

@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+from biresnerf.data.formats.codec import cannot_hold
 from biresnerf.data.model.atomic_file import write_text
 from biresnerf.data.model.colmap_scene import ColmapModel, RigidPose, Sensor
-from biresnerf.errors import InputError
 
 
 def write_colmap_text(model: ColmapModel, folder: Path) -> None:
@@ -21,12 +21,11 @@ def write_colmap_text(model: ColmapModel, folder: Path) -> None:
     """
     for image in model.images.values():
         if len(image.name.split()) != 1 or image.name.startswith("#"):
-            raise InputError(
-                "export_not_possible",
+            raise cannot_hold(
+                "colmap-text",
                 f"COLMAP's text tables cannot hold this model: the name {image.name!r} has a space in it, and every "
                 "reader of the text tables cuts it there.",
-                where="colmap-text",
-                hint="Use the binary model in colmap/sparse/0, or rename the image.",
+                "Use the binary model in colmap/sparse/0, or rename the image.",
             )
     for table in model.tables:
         write_text(folder / f"{table}.txt", "\n".join(_TABLES[table](model)))

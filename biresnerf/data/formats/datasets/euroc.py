@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.formats.codec import Codec, head_holds
+from biresnerf.data.formats.colmap.model_checks import unsupported
 from biresnerf.data.formats.parsed_poses import Assignment, ParsedPoses, PoseEntry
 from biresnerf.data.formats.pose_rows import Placed, Row, lens_of, parsed_rows, pose_of_numbers
 from biresnerf.data.formats.simple.times_of_images import MAX_TIME_APART_S, nearest_poses
@@ -46,11 +47,7 @@ _COLUMNS = 8  # of the time and the pose; velocities and biases follow
 
 
 def parse_euroc(root: Path, file: Path) -> ParsedPoses:
-    """The poses of cam0 at the times of the body's; each photo takes the nearest within 0.02 s.
-
-    Raises:
-        InputError: codes as in docs/input.md.
-    """
+    """The poses of cam0 at the times of the body's; each photo takes the nearest within 0.02 s."""
     sensor = file.parent.parent / "cam0" / "sensor.yaml"
     body_from_cam, lens = _read_sensor(sensor)
 
@@ -124,11 +121,10 @@ def _read_sensor(file: Path) -> tuple[NDArray[np.float64], Camera]:
     elif kind in ("radial-tangential", "radtan"):
         full = FullParameters(fx, fy, *centre, k1=a, k2=b, p1=c, p2=d)
     else:
-        raise InputError(
-            "camera_model_unsupported",
+        raise unsupported(
+            f"cam0/{file.name} distortion_model",
             f"the distortion model {kind[:40]!r} is not supported.",
-            where=f"cam0/{file.name} distortion_model",
-            hint="Supported are radial-tangential and equidistant.",
+            "Supported are radial-tangential and equidistant.",
         )
     return body_from_cam, lens_of(full, f"cam0/{file.name}", (int(width), int(height)))
 

@@ -53,11 +53,7 @@ _BLOCK_HINT = "Give five lines an image: two numbers and an error, then 4 rows o
 
 
 def parse_realestate10k(_root: Path, file: Path) -> ParsedPoses:
-    """The cameras of ``file``, called by their times.
-
-    Raises:
-        InputError: codes as in docs/input.md.
-    """
+    """The cameras of ``file``, called by their times."""
     lines = read_words(file)
     rows = [(words[0], where, words) for where, words in lines if not words[0].startswith("http")]
     parsed = parsed_rows(REALESTATE10K, [file], rows, _read_line, photo_folders=("frames",))

@@ -95,11 +95,7 @@ class _BopCamera(BaseModel, allow_inf_nan=False):
 
 
 def parse_bop(_root: Path, file: Path) -> ParsedPoses:
-    """The cameras of a scene, each for the image of its number.
-
-    Raises:
-        InputError: codes as in docs/input.md.
-    """
+    """The cameras of a scene, each for the image of its number."""
     rows: list[Row] = []
     for number, value in read_json_object(file).items():
         where = f"{file.name} {number}"

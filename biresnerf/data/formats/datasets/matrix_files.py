@@ -41,11 +41,7 @@ _MATRIX = rb"(?i)\s*(?:%b\s+){11}(?:(?:%b\s+){4})?%b\s*\Z" % (_NUMBER, _NUMBER, 
 
 
 def parse_matrix_files(_root: Path, place: Path) -> ParsedPoses:
-    """The poses of the files in ``place``, each for the image of its name.
-
-    Raises:
-        InputError: codes as in docs/input.md.
-    """
+    """The poses of the files in ``place``, each for the image of its name."""
     files = _pose_files(place)
     root = _image_root(place)
     shared = next((root / name for name in _SHARED if (root / name).is_file()), None)

@@ -24,8 +24,7 @@ from biresnerf.data.formats.simple.llff import rows_by_name
 from biresnerf.data.model.array_file import npz_numbers
 from biresnerf.data.model.atomic_file import whole_file
 from biresnerf.data.model.refined_set import RefinedSet
-from biresnerf.data.model.untrusted_file import invalid_file
-from biresnerf.errors import InputError
+from biresnerf.data.model.untrusted_file import invalid_file, refuse_not_finite
 from biresnerf.geometry.focus import focus_point
 from biresnerf.options.formats import Format
 
@@ -57,9 +56,6 @@ def parse_neus(_root: Path, file: Path) -> ParsedPoses:
     """The cameras of ``file`` in its world, before ``scale_mat``; for the images in the order of their names.
 
     Where there are fewer images than cameras, their names must be the cameras' numbers.
-
-    Raises:
-        InputError: codes as in docs/input.md.
     """
     rows = [(str(n), f"{file.name} world_mat_{n}", one) for n, one in sorted(_world_matrices(file).items())]
     folders = ("image", "rgb")
@@ -94,8 +90,7 @@ def _decomposed(matrix: NDArray[np.float64], where: str) -> Placed:
     """The pose and lens of a projection K [R | t], of any scale."""
     if matrix.shape not in ((3, 4), (4, 4)):
         raise invalid_file(where, f"is an array of shape {matrix.shape}, not 4 x 4.", _HINT)
-    if not np.isfinite(matrix).all():
-        raise InputError("pose_not_finite", "NaN or an infinite number.", where=where, hint=_HINT)
+    refuse_not_finite(matrix, where, _HINT)
     projection = matrix[:3] * (1.0 if np.linalg.det(matrix[:3, :3]) > 0.0 else -1.0)
     # K R by a QR of the transposed block in reverse order, with the signs that make K's diagonal positive.
     q, r = np.linalg.qr(projection[::-1, :3].T)

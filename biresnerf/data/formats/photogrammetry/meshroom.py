@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from biresnerf.data.formats.codec import BROWN, FISHEYE, Codec, LensLimits, head_holds
-from biresnerf.data.formats.colmap.model_checks import listed_name
+from biresnerf.data.formats.colmap.model_checks import listed_name, unsupported
 from biresnerf.data.formats.parsed_poses import ParsedPoses
 from biresnerf.data.formats.photogrammetry.views import View, listed, parsed_views, pose_of_centre
 from biresnerf.data.formats.pose_rows import folder_with_photos, lens_of
@@ -29,7 +29,6 @@ from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.refined_set import Landmark, RefinedSet
 from biresnerf.data.model.untrusted_file import checked, invalid_file, read_json_object
 from biresnerf.data.photos.panoramas.panorama import panorama_camera
-from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera, FullParameters
 from biresnerf.options.formats import Format
 
@@ -95,11 +94,7 @@ class _Lens(BaseModel, allow_inf_nan=False):
 
 
 def parse_meshroom(_root: Path, file: Path) -> ParsedPoses:
-    """The views of ``file``; those without a pose have none.
-
-    Raises:
-        InputError: codes as in docs/input.md.
-    """
+    """The views of ``file``; those without a pose have none."""
     document = read_json_object(file)
     numbers = document.get("version")
     words = [str(number) for number in numbers] if isinstance(numbers, list) else []
@@ -142,11 +137,10 @@ def _read_lens(row: dict[str, Any], where: str, version: tuple[int, ...]) -> Cam
     if kind == "equirectangular":
         return panorama_camera(lens.width, lens.height, where)
     if names is None or lens.undistortionType != "none":
-        raise InputError(
-            "camera_model_unsupported",
+        raise unsupported(
+            where,
             f"the lens {kind[:40]} is not supported.",
-            where=where,
-            hint="Supported are pinhole, radial1, radial3, brown and fisheye4, or undistorted photos.",
+            "Supported are pinhole, radial1, radial3, brown and fisheye4, or undistorted photos.",
         )
     values = [float(value) for value in lens.distortionParams]
     if values and len(values) != len(names):

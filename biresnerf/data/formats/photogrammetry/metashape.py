@@ -19,7 +19,12 @@ from numpy.typing import NDArray
 
 from biresnerf.data.formats.bad_frames import attempt
 from biresnerf.data.formats.codec import Codec, head_holds
-from biresnerf.data.formats.colmap.model_checks import camera_of_numbers, image_name, supported_model
+from biresnerf.data.formats.colmap.model_checks import (
+    camera_of_numbers,
+    image_name,
+    supported_model,
+    unsupported,
+)
 from biresnerf.data.formats.parsed_poses import ParsedPoses
 from biresnerf.data.formats.photogrammetry.xml_file import read_xml
 from biresnerf.data.formats.pose_rows import Placed, parsed_rows, pose_by, shear_of, without_skew
@@ -50,9 +55,6 @@ def parse_metashape(_root: Path, file: Path) -> ParsedPoses:
     Labels are file names, with or without extension. The world is the chunk's own frame: the chunk's transform into
     geographic coordinates is not applied. Cameras that are not aligned, or belong to another component than most, have
     no pose.
-
-    Raises:
-        InputError: codes as in docs/input.md.
     """
     chunk = the_chunk(file)
     sensors = {sensor.get("id"): sensor for sensor in chunk.iter("sensor")}
@@ -161,11 +163,10 @@ def _camera(sensor: ElementTree.Element | None, where: str) -> Camera | None:
     if kind == "spherical":
         return panorama_camera(*_resolution(sensor, calibration, where), where)
     if kind != "frame":
-        raise InputError(
-            "camera_model_unsupported",
+        raise unsupported(
+            where,
             f"the camera type {kind[:40]} is not supported.",
-            where=where,
-            hint="Export undistorted images and cameras of the type frame.",
+            "Export undistorted images and cameras of the type frame.",
         )
     if calibration is None:
         return None
@@ -175,11 +176,10 @@ def _camera(sensor: ElementTree.Element | None, where: str) -> Camera | None:
         values[name] = float(numbers[0]) if len(numbers) else 0.0
     unmodelled = [name for name in ("k4", "p3", "p4") if values[name]]
     if unmodelled:
-        raise InputError(
-            "camera_model_unsupported",
+        raise unsupported(
+            where,
             f"{', '.join(unmodelled)} is not zero, and no supported camera model has it.",
-            where=where,
-            hint="Optimise the cameras without it and export again, or export undistorted images.",
+            "Optimise the cameras without it and export again, or export undistorted images.",
         )
     width, height = _resolution(sensor, calibration, where)
     shear = shear_of(values["b2"], values["f"] or values["fy"], where)

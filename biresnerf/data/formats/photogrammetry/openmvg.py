@@ -85,11 +85,7 @@ class _Lens(_Size, allow_inf_nan=False):
 
 
 def parse_openmvg(_root: Path, file: Path) -> ParsedPoses:
-    """The views of ``file``; those without a pose have none.
-
-    Raises:
-        InputError: codes as in docs/input.md.
-    """
+    """The views of ``file``; those without a pose have none."""
     document = read_json_object(file)
 
     def pose(value: Any, where: str) -> NDArray[np.float64]:

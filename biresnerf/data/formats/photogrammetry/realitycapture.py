@@ -1,10 +1,15 @@
-"""RealityCapture's csv of internal and external camera parameters, or of positions with omega, phi and kappa.
+"""RealityCapture's csv of internal and external camera parameters, or of positions with angles, and its XMP of photos.
 
-The program's source is closed: columns and conventions are those by which nerfstudio reads the file
+The program's source is closed: columns and conventions of the csv are those by which nerfstudio reads the file
 (process_data/realitycapture_utils.py, 1.1.5). Heading (clockwise), pitch and roll are degrees: world_from_cam with
 OpenGL axes is Rz(-heading) Rx(pitch) Ry(roll). The focal length is that of a film 36 mm wide; px and py are shares of
 the longer side, from the centre; t1 and t2 are OpenCV's p1 and p2. Of omega, phi and kappa it is
 Ry(kappa) Rx(phi) Rz(-omega): so the program's XMP files of the same photos have it, to 1e-13.
+
+Axes and units of an XMP: its support article "RealityCapture XMP camera math": the rotation is cam_from_world by rows,
+OpenCV axes, beside the camera's centre; lengths as in the csv. Coefficients are k1 to k4, t1 and t2; t1 is OpenCV's p2
+and t2 its p1, as AliceVision (src/software/convert/main_importKnownPoses.cpp) and camorph take them. nerfstudio takes
+those of the csv the other way round; both are zero unless a model with tangential distortion was chosen.
 """
 
 from __future__ import annotations
@@ -12,23 +17,23 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.formats.codec import Codec, LensLimits, head_holds
-from biresnerf.data.formats.colmap.model_checks import listed_name
+from biresnerf.data.formats.codec import Codec, LensLimits, cannot_hold, head_holds
+from biresnerf.data.formats.colmap.model_checks import listed_name, unsupported
 from biresnerf.data.formats.parsed_poses import LensOf, ParsedPoses
-from biresnerf.data.formats.pose_rows import Placed, at_size_of, lens_of, parsed_rows, pose_by
+from biresnerf.data.formats.photogrammetry.views import pose_of_centre
+from biresnerf.data.formats.photogrammetry.xml_file import read_xml
+from biresnerf.data.formats.pose_rows import Placed, at_size_of, lens_of_shares, parsed_rows, pose_by
 from biresnerf.data.model.atomic_file import write_text
 from biresnerf.data.model.refined_set import RefinedSet
-from biresnerf.data.model.untrusted_file import Table, invalid_file, read_table, read_text
-from biresnerf.errors import InputError
-from biresnerf.geometry.camera.camera_models import Camera, FullParameters
+from biresnerf.data.model.untrusted_file import Table, finite_numbers, invalid_file, read_table, read_text
+from biresnerf.geometry.camera.camera_models import FullParameters
 from biresnerf.geometry.rigid import rotation_about
 from biresnerf.options.formats import Format
 
@@ -48,24 +53,31 @@ REALITYCAPTURE = Format(
     heading="For RealityCapture",
     hint="Internal/External camera parameters, by the photos' file names",
 )
+REALITYCAPTURE_XMP = Format(
+    name="realitycapture-xmp",
+    title="RealityCapture XMP",
+    rank=66,
+    found_as=("images", "."),
+    gives="an .xmp beside each photo",
+    checked_against="its article on camera maths; KU-Leuven-Geomatics/geomapi",
+)
 COLUMNS = (
     "name", "x", "y", "alt", "heading", "pitch", "roll", "f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2",
 )  # fmt: skip
 _FILM_MM = 36.0
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
-
-
 _HINT = "Export Internal/External camera parameters, with the columns name, x, y, alt, heading, pitch, roll and f."
 _NEEDED = COLUMNS[:8]
 _WITHOUT_LENS = ("name", "x", "y", "z", "omega", "phi", "kappa")
+_XMP_HINT = "Export the XMP again, with poses and Brown3 distortion or none."
+_MODELS = ("perspective", "brown3", "brown3t2", "brown4", "brown4t2", "division")
+_AS_SQUARE, _NO_SKEW = 1e-6, 1e-6
+_begins_so = head_holds(b"capturingreality.com/ns/xcr")
+_LENS_KEYS = ("FocalLength35mm", "PrincipalPointU", "PrincipalPointV", "Skew", "AspectRatio")
 
 
 def parse_realitycapture(_root: Path, file: Path) -> ParsedPoses:
-    """The rows of ``file``. Columns other than pose and focal length may be missing; with omega they are all there are.
-
-    Raises:
-        InputError: codes as in docs/input.md.
-    """
+    """The rows of ``file``. Columns other than pose and focal length may be missing; with omega there are no others."""
     titles = {name: (name,) for name in (*COLUMNS, *_WITHOUT_LENS)}
     table = read_table(file.name, read_text(file).splitlines(), titles, lambda found: "name" in found)
     if table is None:
@@ -95,11 +107,8 @@ def parse_realitycapture(_root: Path, file: Path) -> ParsedPoses:
         pose = pose_by(REALITYCAPTURE, np.column_stack([rotation, centre]), where)
         if not with_lens:
             return pose, None
-        distortion = FilmLens(
-            value["f"], value["px"], value["py"],
-            (value["k1"], value["k2"], value["k3"], value["k4"]), (value["t1"], value["t2"]),
-        )  # fmt: skip
-        return pose, lens_on_film(distortion, where)
+        coefficients = [value[name] for name in ("k1", "k2", "k3", "k4", "t1", "t2")]
+        return pose, _lens_on_film(value["f"], (value["px"], value["py"]), coefficients, where)
 
     rows = [(listed_name(table.cell(row, "name"), where), where, row) for where, row in table.rows]
     notes = _perhaps_radians(file.name, table, angles)
@@ -118,43 +127,24 @@ def _perhaps_radians(file: str, table: Table, angles: Sequence[str]) -> list[str
     return []
 
 
-class FilmLens(NamedTuple):
-    """A lens in RealityCapture's units.
+def _lens_on_film(
+    focal_mm: float, centre: tuple[float, float], coefficients: Sequence[float], where: str
+) -> LensOf:
+    """The lens at each image's size, from k1 to k4, and OpenCV's p1 and p2.
 
-    Attributes:
-        focal_mm: of a film 36 mm wide.
-        u, v: the principal point from the centre, in shares of the longer side.
-        radial: k1 to k4.
-        tangential: OpenCV's p1 and p2.
+    Raises:
+        InputError: ``camera_model_unsupported`` for a fourth radial coefficient.
     """
-
-    focal_mm: float
-    u: float
-    v: float
-    radial: tuple[float, float, float, float]
-    tangential: tuple[float, float]
-
-
-def lens_on_film(lens: FilmLens, where: str) -> LensOf:
-    """The lens at each image's size. Raises InputError ``camera_model_unsupported`` for a fourth radial coefficient."""
-    k1, k2, k3, k4 = lens.radial
+    k1, k2, k3, k4, p1, p2 = coefficients
     if k4:
-        raise InputError(
-            "camera_model_unsupported",
+        raise unsupported(
+            where,
             "k4 is not zero, and no supported camera model has it.",
-            where=where,
-            hint="Set the distortion model to Brown3 and export again, or export undistorted images.",
+            "Set the distortion model to Brown3 and export again, or export undistorted images.",
         )
-
-    def at(width: int, height: int) -> Camera:
-        size = max(width, height)
-        focal = lens.focal_mm * size / _FILM_MM
-        cx, cy = lens.u * size + width / 2, lens.v * size + height / 2
-        p1, p2 = lens.tangential
-        full = FullParameters(focal, focal, cx, cy, k1=k1, k2=k2, k3=k3, p1=p1, p2=p2)
-        return lens_of(full, where, (width, height))
-
-    return at_size_of(at)
+    focal = focal_mm / _FILM_MM
+    lens = FullParameters(focal, focal, *centre, k1=k1, k2=k2, k3=k3, p1=p1, p2=p2)
+    return at_size_of(lens_of_shares(lens, where))
 
 
 def write_realitycapture(refined: RefinedSet, path: Path) -> None:
@@ -166,11 +156,10 @@ def write_realitycapture(refined: RefinedSet, path: Path) -> None:
     LensLimits("RealityCapture", fisheye=None, two_focal_lengths=False).refuse(refined.cameras, path.name)
     names = [PurePosixPath(image.file_name).name for image in refined.images]
     if len(set(names)) < len(names):
-        raise InputError(
-            "export_not_possible",
+        raise cannot_hold(
+            path.name,
             "RealityCapture's csv names photos by their file names, which two photos of this set share.",
-            where=path.name,
-            hint="Export `pinhole`, whose photos have names of their own, and convert that.",
+            "Export `pinhole`, whose photos have names of their own, and convert that.",
         )
     file = io.StringIO()
     table = csv.writer(file, lineterminator="\n")
@@ -200,6 +189,62 @@ def _angles_deg(rotation: NDArray[np.float64]) -> tuple[float, float, float]:
     return math.degrees(-yaw), math.degrees(pitch), math.degrees(roll)
 
 
+def parse_realitycapture_xmp(_root: Path, place: Path) -> ParsedPoses:
+    """The poses of the XMP files in ``place``; photos without one, or whose file has only a lens, have none.
+
+    Raises:
+        InputError: codes as in docs/input.md.
+    """
+    files = [path for path in sorted(place.glob("*.xmp")) if _begins_so(path)]
+    rows = [(f"{path.stem}.jpg", path.name, path) for path in files]
+    return parsed_rows(REALITYCAPTURE_XMP, files, rows, _read_xmp, take_file_names=True)
+
+
+def _read_xmp(file: Path, where: str) -> Placed:
+    values = {}
+    for element in read_xml(file, _XMP_HINT).iter():
+        for key, text in [*element.attrib.items(), (element.tag, element.text or "")]:
+            if "capturingreality.com/ns/xcr" in key and text.strip():
+                values[key.rpartition("}")[2]] = text
+
+    def numbers(key: str, count: int) -> list[float]:
+        found: list[float] = finite_numbers(
+            values[key].split(), f"{where} xcr:{key}", _XMP_HINT, count
+        ).tolist()
+        return found
+
+    lens = _xmp_lens(values, {key: numbers(key, 1)[0] for key in _LENS_KEYS if key in values}, numbers, where)
+    if "Position" not in values or "Rotation" not in values:
+        return None, lens
+    rotation = np.array(numbers("Rotation", 9)).reshape(3, 3)
+    return pose_of_centre(rotation.T, numbers("Position", 3), f"{where} xcr:Rotation"), lens
+
+
+def _xmp_lens(
+    values: dict[str, str], given: dict[str, float], numbers: Callable[[str, int], list[float]], where: str
+) -> LensOf | None:
+    """The lens; None where the file has no focal length."""
+    if "FocalLength35mm" not in given:
+        return None
+    model = values.get("DistortionModel", "perspective")
+    k1, k2, k3, k4, t1, t2 = (
+        numbers("DistortionCoeficients", 6) if "DistortionCoeficients" in values else [0.0] * 6
+    )
+    problem = None
+    if model not in _MODELS or (model == "division" and k1):
+        problem = f"the distortion model {model[:40]}"
+    elif abs(given.get("AspectRatio", 1.0) - 1.0) > _AS_SQUARE or abs(given.get("Skew", 0.0)) > _NO_SKEW:
+        problem = "a lens with skew, or whose pixels are not square,"
+    if problem:
+        raise unsupported(where, f"{problem} is not supported.", _XMP_HINT)
+    centre = given.get("PrincipalPointU", 0.0), given.get("PrincipalPointV", 0.0)
+    return _lens_on_film(given["FocalLength35mm"], centre, (k1, k2, k3, k4, t2, t1), where)
+
+
+def _has_xmp(place: Path) -> bool:
+    return place.is_dir() and any(_begins_so(path) for path in sorted(place.glob("*.xmp")))
+
+
 CODECS = (
     Codec(
         REALITYCAPTURE,
@@ -210,5 +255,12 @@ CODECS = (
         ),
         write=lambda refined, path, _: write_realitycapture(refined, path),
         given_back=lambda dataset: dataset.source.dialect == "realitycapture",
+    ),
+    Codec(
+        REALITYCAPTURE_XMP,
+        parse=parse_realitycapture_xmp,
+        recognises=_has_xmp,
+        pose_place=lambda file: file.parent if file.suffix.lower() == ".xmp" else None,
+        image_root=lambda place: place.parent if place.name == "images" else place,
     ),
 )

@@ -55,9 +55,6 @@ def parse_bundler(root: Path, file: Path) -> ParsedPoses:
 
     list.txt, beside the images or the file, says which image each camera is (bundle.rd.out goes with list.rd.txt, both
     of undistorted images); without it their order by name does.
-
-    Raises:
-        InputError: codes as in docs/input.md.
     """
     blocks = _blocks(file)
     list_file, listed = _listed_names(root, file, len(blocks))

@@ -49,23 +49,14 @@ class GlbFile:
         Args:
             name: of both.
             mode: `POINTS` or `LINES`.
-            xyz: [vertices, 3], finite; kept as float32.
+            xyz: [vertices, 3], finite and not none; kept as float32.
             rgb: uint8 [vertices, 3], sRGB.
             indices: of the vertices, for lines two a line.
             triangles: faces between the same vertices, indices [m, 3], drawn faintly from both sides.
-
-        Raises:
-            ValueError: nothing to draw, positions that are not finite, or an index of no vertex.
         """
         positions = np.ascontiguousarray(xyz, dtype="<f4")
-        if len(positions) == 0 or not np.isfinite(positions).all() or len(rgb) != len(positions):
-            raise ValueError(f"{name}: need a finite position and a colour for each vertex")
-        for part in (indices, triangles):
-            if part is not None and (len(part) == 0 or part.min() < 0 or part.max() >= len(positions)):
-                raise ValueError(f"{name}: an index names no vertex")
-        colours = np.full(
-            (len(rgb), 4), 255, dtype=np.uint8
-        )  # four bytes each: rows must start at multiples of 4
+        # Four bytes each: rows must start at multiples of 4.
+        colours = np.full((len(rgb), 4), 255, dtype=np.uint8)
         colours[:, :3] = _linear(rgb)
         bounds = {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
         primitive: dict[str, Any] = {

@@ -13,7 +13,7 @@ from biresnerf.data.formats.pose_rows import Placed, parsed_rows, pose_by
 from biresnerf.data.model.array_file import HEAD_BYTES, npy_numbers
 from biresnerf.data.model.atomic_file import whole_file
 from biresnerf.data.model.refined_set import RefinedSet
-from biresnerf.data.model.untrusted_file import invalid_file, read_bytes
+from biresnerf.data.model.untrusted_file import invalid_file, read_bytes, refuse_not_finite
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.options.formats import Format
@@ -54,17 +54,13 @@ def parse_llff(_root: Path, file: Path) -> ParsedPoses:
 
     A row is a matrix 3 x 5, whose columns are the camera's axes down, right and back, its centre, and height, width and
     focal length (px); then two bounds of depth, which are not used.
-
-    Raises:
-        InputError: codes as in docs/input.md.
     """
     rows = [(str(index), f"{file.name} row {index}", row) for index, row in enumerate(_rows(file))]
     return parsed_rows(LLFF, [file], rows, _read_row, in_order_of_names="as text")
 
 
 def _read_row(row: NDArray[np.float64], where: str) -> Placed:
-    if not np.isfinite(row).all():
-        raise InputError("pose_not_finite", "NaN or an infinite number.", where=where, hint=_HINT)
+    refuse_not_finite(row, where, _HINT)
     down, right, back, centre, (height, width, focal) = row[:15].reshape(3, 5).T
     pose = pose_by(LLFF, np.stack([right, down, -back, centre], axis=1), where)
     return pose, _camera(height, width, focal, where)

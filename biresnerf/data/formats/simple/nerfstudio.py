@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from biresnerf.data.formats.codec import Codec, LensLimits, WriteContext
+from biresnerf.data.formats.codec import Codec, LensLimits, WriteContext, cannot_hold
 from biresnerf.data.formats.simple.points_ply import POINTS_PLY, write_points_ply
 from biresnerf.data.formats.transforms.read_transforms import (
     bind_transforms,
@@ -20,7 +20,6 @@ from biresnerf.data.formats.transforms.write_intrinsics import lens_values, list
 from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.refined_set import RefinedSet
-from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import COEFFICIENTS, Camera
 from biresnerf.options.formats import Format
 
@@ -64,7 +63,7 @@ def write_nerfstudio(refined: RefinedSet, path: Path, dataset: Dataset | None = 
     kinds = {camera.full().fisheye for camera in refined.cameras}
     if len(kinds) > 1:
         what = "nerfstudio takes all lenses of a set for fisheyes, or none."
-        raise InputError("export_not_possible", what, where=NERFSTUDIO.in_result, hint=_LENSES.hint)
+        raise cannot_hold(NERFSTUDIO.in_result, what)
     masks = [{"mask_path": name} for name in _masks(dataset)]
     shared, frames = listed_frames(refined, [_lens(camera) for camera in refined.cameras], masks)
     document: dict[str, Any] = {"camera_model": "OPENCV_FISHEYE" if kinds == {True} else "OPENCV", **shared}

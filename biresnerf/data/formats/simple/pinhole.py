@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from biresnerf.data.formats.codec import Codec
+from biresnerf.data.formats.codec import Codec, cannot_hold
 from biresnerf.data.formats.colmap.write_binary import write_colmap_binary
 from biresnerf.data.formats.simple.bundler import write_bundler
 from biresnerf.data.formats.simple.nerfstudio import NERFSTUDIO, write_nerfstudio
@@ -80,11 +80,10 @@ def pinhole_camera(camera: Camera) -> Camera:
     )
     new_width, new_height = (int(2 * focal * min(tangent, WIDEST_TANGENT)) for tangent in seen)
     if new_width < 2 or new_height < 2:
-        raise InputError(
-            "export_not_possible",
+        raise cannot_hold(
+            PINHOLE.name,
             "a lens of this set sees nothing around its optical axis.",
-            where=PINHOLE.name,
-            hint="Check the principal point.",
+            "Check the principal point.",
         )
     return Camera("PINHOLE", new_width, new_height, (focal, focal, new_width / 2, new_height / 2))
 

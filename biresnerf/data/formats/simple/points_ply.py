@@ -11,10 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from biresnerf.data.formats.codec import Codec
+from biresnerf.data.formats.codec import Codec, cannot_hold
 from biresnerf.data.model.atomic_file import whole_file
 from biresnerf.data.model.refined_set import RefinedSet
-from biresnerf.errors import InputError
 from biresnerf.options.formats import Format
 
 POINTS_PLY = Format(
@@ -42,11 +41,10 @@ def write_points_ply(refined: RefinedSet, path: Path) -> None:
     """
     points = refined.model.points
     if not len(points):
-        raise InputError(
-            "export_not_possible",
+        raise cannot_hold(
+            path.name,
             "there are no points, and programs that start from them (splatting) cannot.",
-            where=path.name,
-            hint="Refine the poses: a result has points wherever they can be found.",
+            "Refine the poses: a result has points wherever they can be found.",
         )
     vertices = np.zeros(len(points), _VERTEX)
     for column, name in enumerate(_XYZ):

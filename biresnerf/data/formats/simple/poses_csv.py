@@ -55,11 +55,7 @@ _HINT = "Give columns image, x, y, z, qw, qx, qy, qz: camera to world, OpenCV ax
 
 
 def parse_poses_csv(root: Path, file: Path) -> ParsedPoses:
-    """The poses of the table ``file``, each for the image of its name.
-
-    Raises:
-        InputError: codes as in docs/input.md.
-    """
+    """The poses of the table ``file``, each for the image of its name."""
     table = _table(file, read_text(file))
     if table is None:
         raise invalid_file(file.name, "has no head that names an image, a position and a quaternion.", _HINT)

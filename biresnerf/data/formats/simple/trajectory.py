@@ -87,9 +87,6 @@ def parse_trajectory(root: Path, file: Path) -> ParsedPoses:
     images' numbers from 0, or that divided by 30 (MASt3R-SLAM); as many poses as images, in order. The camera is that
     of `read_camera_file`, else a guess.
     KITTI's poses are those of camera 0; its calib.txt says how the camera of image_2/ is mounted beside it.
-
-    Raises:
-        InputError: codes as in docs/input.md.
     """
     trajectory = Trajectory(file)
     lens, cam_from_pose, camera_files = read_camera_file(root, _PHOTO_FOLDERS)

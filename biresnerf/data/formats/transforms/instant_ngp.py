@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from biresnerf.data.formats.codec import Codec, LensLimits
+from biresnerf.data.formats.codec import Codec, LensLimits, cannot_hold
 from biresnerf.data.formats.transforms.read_transforms import (
     bind_transforms,
     parse_transforms,
@@ -20,7 +20,6 @@ from biresnerf.data.formats.transforms.read_transforms import (
 from biresnerf.data.formats.transforms.write_intrinsics import lens_values, listed_frames, ngp_coefficients
 from biresnerf.data.model.atomic_file import write_json
 from biresnerf.data.model.refined_set import RefinedSet
-from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import COEFFICIENTS, Camera
 from biresnerf.geometry.focus import focus_point
 from biresnerf.options.formats import Format
@@ -59,7 +58,7 @@ def write_transforms_ngp(refined: RefinedSet, path: Path) -> None:
     for image in refined.images:
         if PurePosixPath(image.file_name).suffix.lower() not in _SUFFIXES:
             what = f"instant-ngp cannot decode {image.file_name}."
-            raise InputError("export_not_possible", what, where=INSTANT_NGP.in_result, hint=_LENSES.hint)
+            raise cannot_hold(INSTANT_NGP.in_result, what)
     _LENSES.refuse(refined.cameras, INSTANT_NGP.in_result)
     shared, frames = listed_frames(refined, [_lens(camera) for camera in refined.cameras])
     scale, offset, aabb_scale = _placement(refined)

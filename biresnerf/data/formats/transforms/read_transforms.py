@@ -91,11 +91,7 @@ def parse_transforms(_root: Path, path: Path) -> ParsedPoses:
 
 
 def bind_transforms(parsed: ParsedPoses, root: Path, within: Path | None = None) -> Dataset:
-    """The dataset of the images that the frames name, with their intrinsics and masks.
-
-    Raises:
-        InputError: codes as in docs/input.md.
-    """
+    """The dataset of the images that the frames name, with their intrinsics and masks."""
     path = parsed.source.files[0]
     refuse_too_few(len(parsed.entries), f"{path.name} frames")
     pairs, found = find_photos(path, root, parsed.entries, within, strict=parsed.strict)
