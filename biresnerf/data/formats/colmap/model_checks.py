@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import posixpath
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,12 +37,6 @@ def broken(where: str, what: str, code: str = "pose_file_invalid", hint: str = _
 def unsupported(where: str, what: str, hint: str) -> InputError:
     """The error for a lens or camera model, at ``where``, that is not read."""
     return InputError("camera_model_unsupported", what, where=where, hint=hint)
-
-
-def refuse_repeated(table: dict[int, Any], number: int, what: str) -> None:
-    """Raises InputError where ``table`` has the id already."""
-    if number in table:
-        raise broken(f"{what} {number}", "two rows have this id")
 
 
 def sensor_type(kind: int, where: str) -> colmap.SensorType:

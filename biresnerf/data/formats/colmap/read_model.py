@@ -12,9 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from biresnerf.data.formats.colmap import read_binary as colmap_binary
-from biresnerf.data.formats.colmap import read_text as colmap_text
 from biresnerf.data.formats.colmap.model_checks import broken, check_images, check_rigs, check_tracks
+from biresnerf.data.formats.colmap.read_tables import READERS, BinaryTable, TextTable
 from biresnerf.data.model import colmap_scene as colmap
 from biresnerf.data.model.untrusted_file import read_bytes, read_text
 from biresnerf.geometry.camera.camera_models import Camera
@@ -103,10 +102,9 @@ class _Tables:
         path = self.folder / self.file(table)
         if not path.is_file():
             return None
-        parser = "parse_" + table.removesuffix("3D")
         if self.file_format == "binary":
-            return getattr(colmap_binary, parser)(read_bytes(path, MAX_TABLE_BYTES), path.name)
-        return getattr(colmap_text, parser)(read_text(path, MAX_TABLE_BYTES), path.name)
+            return READERS[table](BinaryTable(read_bytes(path, MAX_TABLE_BYTES), path.name))
+        return READERS[table](TextTable(read_text(path, MAX_TABLE_BYTES), path.name))
 
 
 def _without_observations(image: colmap.ColmapImage) -> colmap.ColmapImage:

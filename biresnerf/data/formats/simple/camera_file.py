@@ -10,8 +10,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.formats.colmap import read_text as colmap_text
 from biresnerf.data.formats.colmap.model_checks import broken, camera_of_numbers
+from biresnerf.data.formats.colmap.read_tables import TextTable, floats, read_cameras
 from biresnerf.data.formats.parsed_poses import FrameCamera, LensOf
 from biresnerf.data.formats.transforms.read_intrinsics import Fields, camera_of_frame
 from biresnerf.data.model.untrusted_file import read_json_object, read_text
@@ -59,7 +59,7 @@ def read_camera_file(root: Path, photo_folders: Sequence[str] = ()) -> CameraFil
 
         return of_json, np.eye(4), (file,)
     if file.name == "cameras.txt":
-        cameras = list(colmap_text.parse_cameras(read_text(file), file.name).values())
+        cameras = list(read_cameras(TextTable(read_text(file), file.name)).values())
         if len(cameras) != 1:
             raise broken(file.name, f"has {len(cameras)} cameras, and does not say which image is by which")
         return cameras[0], np.eye(4), (file,)
@@ -90,7 +90,7 @@ def _kitti_projection(
         if name not in rows:
             continue
         where = f"{file.name} {name}"
-        values = colmap_text.floats(rows[name].split(), where, "the projection")
+        values = floats(rows[name].split(), where, "the projection")
         if len(values) != 12:
             raise broken(where, f"has {len(values)} numbers, not 12")
         return name, np.array(values, dtype=np.float64).reshape(3, 4)
