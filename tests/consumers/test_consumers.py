@@ -19,7 +19,7 @@ from PIL import Image
 from biresnerf.data.formats.codec import WriteContext
 from biresnerf.data.formats.convert import convert
 from biresnerf.data.formats.read_dataset import read_dataset
-from biresnerf.data.formats.result_formats import write_exports, write_result_formats
+from biresnerf.data.formats.result_formats import export_result, write_result_formats
 from biresnerf.data.formats.simple.llff import write_llff
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS
@@ -131,7 +131,7 @@ def test_nerfstudio_reads_a_set_in_blenders_dialect_once_it_is_converted(tmp_pat
 def pinhole(tmp_path) -> tuple[Path, RefinedSet, list[str]]:
     """The export of a set whose lens the splatting programs do not know, and the names of its photos there."""
     refined = result(tmp_path, "FULL_OPENCV")
-    write_exports(refined, tmp_path, ["pinhole"], WriteContext())
+    export_result(refined, tmp_path, ["pinhole"], WriteContext())
     names = json.loads((tmp_path / "pinhole/names.json").read_text())
     return (
         tmp_path / "pinhole",
@@ -172,7 +172,7 @@ def test_pycolmap_reads_the_model(tmp_path):
 @opens("kitti", by="evo")
 def test_evo_reads_trajectories_in_the_sets_order(tmp_path):
     refined = result(tmp_path)
-    write_exports(refined, tmp_path, ["kitti"], WriteContext())
+    export_result(refined, tmp_path, ["kitti"], WriteContext())
     tum, kitti = read_by("evo_tum", tmp_path / "tum.txt"), read_by("evo_kitti", tmp_path / "kitti.txt")
     np.testing.assert_allclose(tum["rows"], refined.world_from_cam, atol=1e-12)
     np.testing.assert_allclose(kitti["rows"], refined.world_from_cam, atol=1e-12)
@@ -234,7 +234,7 @@ def test_blender_shows_the_scene_at_the_inputs_own_coordinates(tmp_path):
 @opens("realitycapture", by="nerfstudio")
 def test_nerfstudio_converts_realitycaptures_csv(tmp_path):
     refined = result(tmp_path, "FULL_OPENCV", k4=0.0, k5=0.0, k6=0.0, fx=70.0, fy=70.0)
-    write_exports(refined, tmp_path, ["realitycapture"], WriteContext())
+    export_result(refined, tmp_path, ["realitycapture"], WriteContext())
     found = read_by("nerfstudio_realitycapture", tmp_path)
     assert_poses(found["poses"], refined, NAMES, 1e-12)
     full = refined.cameras[0].full()

@@ -62,42 +62,31 @@ def write_result_formats(
     return (*notes, *writing.notes)
 
 
-def write_exports(
-    refined: RefinedSet, folder: Path, names: Iterable[str], context: WriteContext
-) -> tuple[list[str], list[str]]:
-    """Writes formats where a result in ``folder`` has them. Returns those written, and notes on what stands for what.
-
-    Raises:
-        InputError: ``export_not_possible``; formats before it are written.
-    """
-    writing = write_each(refined, names, lambda name: _write(refined, folder, name, context))
-    writing.raise_first()
-    return writing.written, writing.notes
-
-
 def export_result(
-    refined: RefinedSet, folder: Path, names: Iterable[str], context: WriteContext, poses_of: PosesOf
+    refined: RefinedSet,
+    folder: Path,
+    names: Iterable[str],
+    context: WriteContext,
+    poses_of: PosesOf = "camera",
 ) -> tuple[list[str], list[str]]:
-    """`write_exports`, or `write_body` for the poses of what carries the camera."""
-    write = write_exports if poses_of == "camera" else write_body
-    return write(refined, folder, names, context)
+    """Writes formats where a result in ``folder`` has them; the poses of what carries the camera into its body/.
 
-
-def write_body(
-    refined: RefinedSet, folder: Path, names: Iterable[str], context: WriteContext
-) -> tuple[list[str], list[str]]:
-    """Writes the poses of what carries the camera into ``folder``/body: in ``names``, and as every result has them.
+    These also as every result has them.
 
     Returns:
         the formats written, and notes: what is not known of the offset, and what stands for what.
 
     Raises:
-        InputError: ``export_not_possible``: no offset is known, or a format shows what cameras see; others are written.
+        InputError: ``export_not_possible``: a format cannot hold the set, or shows what cameras see where the body's
+            poses are asked for, or no offset is known; others are written.
     """
     names = list(dict.fromkeys(names))
-    if seeing := [name for name in names if not formats()[name].holds_bodies]:
-        raise _not_of_body(f"{', '.join(seeing)} would show what cameras see")
-    writing = _write_bodies(refined, folder, names, context)
+    if poses_of == "camera":
+        writing = write_each(refined, names, lambda name: _write(refined, folder, name, context))
+    else:
+        if seeing := [name for name in names if not formats()[name].holds_bodies]:
+            raise _not_of_body(f"{', '.join(seeing)} would show what cameras see")
+        writing = _write_bodies(refined, folder, names, context)
     writing.raise_first()
     return writing.written, writing.notes
 
@@ -105,7 +94,7 @@ def write_body(
 def write_body_beside(
     refined: RefinedSet, folder: Path, exports: Iterable[str], context: WriteContext
 ) -> tuple[str, ...]:
-    """The same beside a result, in the input's own format as well. Returns a note for all that cannot be written."""
+    """The body's poses beside a result, also in the input's own format. Returns a note for all that is not written."""
     names = list(dict.fromkeys(exports))
     try:
         writing = _write_bodies(

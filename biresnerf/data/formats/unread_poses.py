@@ -36,7 +36,7 @@ _INNERMOST = re.compile(r"[\[({]([^\[\](){}]*)[\])}]")
 
 @dataclass(frozen=True)
 class UnreadForm:
-    """What a program calls its files, as globs from the set's folder, and what the first bytes match."""
+    """What a program calls its files, as globs in a folder, and what the first bytes match."""
 
     program: str
     names: tuple[str, ...]
@@ -54,19 +54,23 @@ UNREAD = (
 )
 
 
+def _unread_form(path: Path) -> UnreadForm | None:
+    """That of a file which holds camera poses of a program whose form is not read; None of others."""
+    called = (form for form in UNREAD if any(fnmatch(path.name, name) for name in form.names))
+    return next((form for form in called if re.match(form.begins, head_of(path))), None)
+
+
 def refuse_unread(root: Path) -> None:
     """Raise `InputError` ``poses_not_read`` if the folder holds poses of a program whose form is not read."""
-    for form in UNREAD:
-        for name in form.names:
-            for path in sorted(root.glob(name)):
-                if path.is_file() and re.match(form.begins, head_of(path)):
-                    raise InputError(
-                        "poses_not_read",
-                        f"holds camera poses of {form.program}, a form that is not read.",
-                        where=path.relative_to(root).as_posix(),
-                        hint="Convert them to one of the formats of docs/formats.md, or move them out of the folder to "
-                        "have the poses found from the photos alone.",
-                    )
+    for path in sorted(root.iterdir()):
+        if (form := _unread_form(path)) is not None:
+            raise InputError(
+                "poses_not_read",
+                f"holds camera poses of {form.program}, a form that is not read.",
+                where=path.name,
+                hint="Convert them to one of the formats of docs/formats.md, or move them out of the folder to have "
+                "the poses found from the photos alone.",
+            )
 
 
 def folders_of_set(root: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
@@ -93,9 +97,8 @@ def pose_like_notes(root: Path, names: Sequence[str], known: Sequence[Path] = ()
         others = [folder / name for name in files if not is_photo_name(name) and folder / name not in known]
         notes += [
             f"{path.relative_to(root).as_posix()} holds camera poses of {form.program}, which are not read"
-            for form in UNREAD
             for path in others
-            if any(fnmatch(path.name, name) for name in form.names) and re.match(form.begins, head_of(path))
+            if (form := _unread_form(path)) is not None
         ]
         own = [path for path in others if _stem(path.name) in stems and not _NO_POSES.search(path.name)]
         if len(own) >= max(3, len(stems) / 2):

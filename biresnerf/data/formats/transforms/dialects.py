@@ -11,7 +11,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -163,18 +162,10 @@ def _refuse_other_meanings(document: dict[str, Any], rows: list[dict[str, Any]],
                     hint="Give k1, k2, p1, p2 and k3 as keys of their own, by OpenCV's names.",
                 )
     if rows and not any("transform_matrix" in row for row in rows):
-        named = _matrices(rows[0].items())
-        if named:
+        named = [key for key, value in rows[0].items() if _POSES.search(key) and _matrix(value) is not None]
+        if named := [key for key in named if key not in _LENSES]:
             raise invalid_file(
                 f"{file} frames[0].{named[0]}",
                 "is a matrix under a key that is not read.",
                 "Give camera to world with OpenGL axes as transform_matrix.",
             )
-
-
-def _matrices(items: Iterable[tuple[str, Any]]) -> list[str]:
-    return [
-        key
-        for key, value in items
-        if _POSES.search(key) and key not in _LENSES and _matrix(value) is not None
-    ]

@@ -57,11 +57,7 @@ def turning_notes(dataset: Dataset) -> tuple[str, ...]:
     """
     if dataset.posed.any():
         return ()
-    return notes_on(thumbnails(dataset, natural_order(dataset.file_names)) / np.float32(255))
-
-
-def notes_on(grey: NDArray[np.float32]) -> tuple[str, ...]:
-    """`turning_notes` of photos in order, shrunk and in grey [n, h, w], 0 to 1."""
+    grey = thumbnails(dataset, natural_order(dataset.file_names)) / np.float32(255)
     if not goes_round(grey):
         return ()
     return (TURNING, IN_THE_WAY) if still_surroundings(grey) else (TURNING,)

@@ -47,14 +47,8 @@ class FrameStream:
             *(get_ffmpeg_exe(), "-nostdin", "-hide_banner", "-loglevel", "level+info", "-nostats"),
             *("-protocol_whitelist", "file,pipe", "-max_pixels", str(MAX_IMAGE_PIXELS)),
             *("-f", DEMUXERS[video.suffix.lower()], "-i", f"file:{self._video}", "-map", "0:v:0"),
-            *(
-                "-vf",
-                f"{filters},showinfo=checksum=0",
-                "-sws_flags",
-                _FILTER_FLAGS,
-                "-fps_mode",
-                "passthrough",
-            ),
+            *("-vf", f"{filters},showinfo=checksum=0", "-sws_flags", _FILTER_FLAGS),
+            *("-fps_mode", "passthrough"),
             # Phones film in 10 bits, which FFmpeg would write as numbers of 16.
             *("-pix_fmt", "gray" if grey else "rgb24", "-f", "image2pipe", "-c:v", "pgm" if grey else "ppm"),
             "pipe:1",
@@ -76,7 +70,12 @@ class FrameStream:
                 while (frame := _next_picture(process.stdout)) is not None:
                     count += 1
                     if count > MOST_FRAMES:
-                        raise self._too_long()
+                        raise InputError(
+                            "video_too_long",
+                            f"has more than {MOST_FRAMES} frames.",
+                            where=self._name,
+                            hint="Cut it: a few minutes around the scene are enough.",
+                        )
                     yield frame
                 process.stdout.close()  # so that FFmpeg ends, should it have more to say
                 process.wait(_TO_END_S)
@@ -100,14 +99,6 @@ class FrameStream:
                 self.times_s.append(float(found[1]))
             elif (error := _ERROR.search(line)) is not None and not self._problem:
                 self._problem = error[1].decode(errors="replace").replace(str(self._video), self._name)
-
-    def _too_long(self) -> InputError:
-        return InputError(
-            "video_too_long",
-            f"has more than {MOST_FRAMES} frames.",
-            where=self._name,
-            hint="Cut it: a few minutes around the scene are enough.",
-        )
 
 
 def _next_picture(stream: IO[bytes]) -> NDArray[np.uint8] | None:

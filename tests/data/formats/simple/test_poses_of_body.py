@@ -13,8 +13,8 @@ from biresnerf.commands.poses.export import export_command
 from biresnerf.data.formats.codec import WriteContext
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.formats.result_formats import (
+    export_result,
     read_result,
-    write_body,
     write_body_beside,
     write_result_formats,
 )
@@ -67,7 +67,7 @@ def test_without_an_offset_or_where_cameras_see_the_export_is_refused(tmp_path):
         (with_offset(WHOLE), ["kitti", "bundler"], "bundler"),
     ):
         with pytest.raises(InputError) as caught:
-            write_body(refined, tmp_path, names, WriteContext())
+            export_result(refined, tmp_path, names, WriteContext(), "body")
         assert_complete(caught.value, "export_not_possible", "poses_of=body")
         assert word in str(caught.value)
         assert not list(tmp_path.iterdir())
@@ -76,7 +76,7 @@ def test_without_an_offset_or_where_cameras_see_the_export_is_refused(tmp_path):
 @pytest.mark.parametrize(("known", "words"), [(2, "along 1 of 3 directions."), (0, "sits on the body.")])
 def test_a_shift_that_is_not_known_is_said(tmp_path, known, words):
     refined = with_offset(BodyOffset(BODY_FROM_CAM, 0.01 if known else None, np.eye(3)[:, :known]))
-    _, notes = write_body(refined, tmp_path, [], WriteContext())
+    _, notes = export_result(refined, tmp_path, [], WriteContext(), "body")
     assert any(words in note for note in notes)
 
 
