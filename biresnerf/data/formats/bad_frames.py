@@ -29,6 +29,21 @@ def tolerate(bad: int, total: int, error: InputError, *, strict: bool) -> None:
         raise error
 
 
+def missing_images(missing: Sequence[str], total: int, where: str, hint: str, *, strict: bool) -> list[str]:
+    """A note on images of these names that were not found.
+
+    Raises:
+        InputError: ``image_missing``, by the rule of `tolerate`.
+    """
+    if not missing:
+        return []
+    listed = f"{len(missing)} of {total} images not found: {few_names(missing)}"
+    tolerate(
+        len(missing), total, InputError("image_missing", f"{listed}.", where=where, hint=hint), strict=strict
+    )
+    return [f"{listed}; they are left out"]
+
+
 def good_frames(
     outcomes: Sequence[T | InputError], names: Sequence[str], *, strict: bool
 ) -> tuple[list[T], list[int], list[str]]:

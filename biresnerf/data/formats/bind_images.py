@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from biresnerf.data.formats.bad_frames import attempt, good_frames, tolerate
+from biresnerf.data.formats.bad_frames import attempt, good_frames, missing_images
 from biresnerf.data.formats.match_names import EXPECTED, match_files
 from biresnerf.data.formats.parsed_poses import Assignment, FrameCamera, ParsedPoses, PoseEntry, panorama_lens
 from biresnerf.data.model.dataset import Dataset, Frame, IntrinsicsSource, SourceFormat
@@ -75,15 +75,10 @@ def by_name(entries: Sequence[PoseEntry], names: Sequence[str], *, strict: bool 
         InputError: ``image_missing``.
     """
     found, notes = match_files([entry.name for entry in entries], names)
-    missing = [entry for entry in entries if entry.name not in found]
-    if missing:
-        listed = (
-            f"{len(missing)} of {len(entries)} images not found: {few_names(one.name for one in missing)}"
-        )
-        hint = "Put the images into images/ under the names that the poses are given for."
-        error = InputError("image_missing", f"{listed}.", where=missing[0].where, hint=hint)
-        tolerate(len(missing), len(entries), error, strict=strict)
-        notes.append(f"{listed}; they are left out")
+    missing = {entry.name: entry.where for entry in entries if entry.name not in found}
+    hint = "Put the images into images/ under the names that the poses are given for."
+    where = next(iter(missing.values()), "")
+    notes += missing_images([*missing], len(entries), where, hint, strict=strict)
     return [(found[entry.name], entry) for entry in entries if entry.name in found], notes
 
 

@@ -94,6 +94,24 @@ class ColmapPoints:
     def __len__(self) -> int:
         return len(self.ids)
 
+    @property
+    def owner(self) -> NDArray[np.int64]:
+        """The row of the point that each track element is of, int64 [k]."""
+        return np.repeat(np.arange(len(self)), np.diff(self.track_starts))
+
+    def only(self, points: NDArray[np.bool_], elements: NDArray[np.bool_]) -> ColmapPoints:
+        """Those of these points [m], with these elements [k] of their tracks alone."""
+        lengths = np.bincount(self.owner[elements], minlength=len(self))[points]
+        return ColmapPoints(
+            self.ids[points],
+            self.xyz[points],
+            self.rgb[points],
+            self.errors[points],
+            np.concatenate([np.zeros(1, np.int64), np.cumsum(lengths)]),
+            self.track_image_ids[elements],
+            self.track_point2d_indices[elements],
+        )
+
 
 def no_points() -> ColmapPoints:
     """The points of a model that has none."""

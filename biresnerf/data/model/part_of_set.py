@@ -70,21 +70,9 @@ def without_images(model: ColmapModel, names: Set[str]) -> ColmapModel:
         return model
     points = model.points
     stays = ~np.isin(points.track_image_ids, list(gone))
-    owner = np.repeat(np.arange(len(points)), np.diff(points.track_starts))
-    lengths = np.bincount(owner[stays], minlength=len(points))
+    lengths = np.bincount(points.owner[stays], minlength=len(points))
     # A point that had no track to begin with loses nothing.
-    seen = (lengths > 0) | (np.diff(points.track_starts) == 0)
-    starts = np.concatenate([np.zeros(1, np.int64), np.cumsum(lengths[seen])])
-    kept = replace(
-        points,
-        ids=points.ids[seen],
-        xyz=points.xyz[seen],
-        rgb=points.rgb[seen],
-        errors=points.errors[seen],
-        track_starts=starts,
-        track_image_ids=points.track_image_ids[stays],
-        track_point2d_indices=points.track_point2d_indices[stays],
-    )
+    kept = points.only((lengths > 0) | (np.diff(points.track_starts) == 0), stays)
     frames = {}
     for number, frame in model.frames.items():
         data = tuple(one for one in frame.data_ids if one[0][0] != "CAMERA" or one[1] not in gone)

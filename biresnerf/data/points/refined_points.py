@@ -160,8 +160,7 @@ def triangulated(model: ColmapModel, tracks: ColmapPoints) -> ColmapPoints:
     Observations that are off by more than `MOST_ERROR_PX` are left out, and points that most of their observations do
     not agree on, that fewer than two images see, or those only by rays within `LEAST_PARALLAX_DEG` of each other.
     """
-    lengths = np.diff(tracks.track_starts)
-    owner = np.repeat(np.arange(len(tracks)), lengths)
+    lengths, owner = np.diff(tracks.track_starts), tracks.owner
     kept = np.isin(tracks.track_image_ids, list(model.images))
     errors = np.full(len(tracks), -1.0)
     xyz = np.zeros((len(tracks), 3))
@@ -187,16 +186,7 @@ def triangulated(model: ColmapModel, tracks: ColmapPoints) -> ColmapPoints:
         good[rows] = errors[rows] <= MOST_ERROR_PX
         good[rows] &= parallax_deg(views.origins, found, point) >= LEAST_PARALLAX_DEG
     kept &= good[owner]
-    lengths = np.bincount(owner[kept], minlength=len(tracks))[good]
-    return ColmapPoints(
-        tracks.ids[good],
-        xyz[good],
-        tracks.rgb[good],
-        errors[good],
-        np.concatenate(([0], np.cumsum(lengths))).astype(np.int64),
-        tracks.track_image_ids[kept],
-        tracks.track_point2d_indices[kept],
-    )
+    return replace(tracks, xyz=xyz, errors=errors).only(good, kept)
 
 
 class _Views:

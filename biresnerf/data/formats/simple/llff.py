@@ -123,9 +123,8 @@ def _bounds_of_points(refined: RefinedSet, index: int) -> tuple[float, float]:
     """The depths between which the image sees all points but a thousandth at either end."""
     model = refined.model
     seen = model.points.track_image_ids == refined.image_ids[index]
-    of_point = np.repeat(np.arange(len(model.points)), np.diff(model.points.track_starts))
     pose = refined.world_from_cam[index]
-    depths = (model.points.xyz[of_point[seen]] - pose[:3, 3]) @ pose[:3, 2]
+    depths = (model.points.xyz[model.points.owner[seen]] - pose[:3, 3]) @ pose[:3, 2]
     depths = depths[depths > 0]
     if not len(depths):
         raise InputError(

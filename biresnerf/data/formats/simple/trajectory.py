@@ -1,10 +1,16 @@
-"""Trajectories of SLAM tools: TUM (position, quaternion, mostly a time), KITTI (12 numbers), a camera beside them."""
+"""Trajectories of SLAM tools: TUM (position, quaternion, mostly a time), KITTI (12 numbers), a camera beside them.
+
+A bad line costs one pose, not the file.
+"""
 
 from __future__ import annotations
 
 import math
+import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +18,7 @@ import numpy as np
 from biresnerf.data.formats.codec import Codec, head_of
 from biresnerf.data.formats.match_names import match_files
 from biresnerf.data.formats.parsed_poses import Assignment, ParsedPoses, PoseEntry
+from biresnerf.data.formats.pose_rows import MAX_ROWS, Placed, entry_of, pose_by, pose_of_numbers
 from biresnerf.data.formats.simple.camera_file import read_camera_file
 from biresnerf.data.formats.simple.times_of_images import (
     MAX_TIME_APART_S,
@@ -20,11 +27,11 @@ from biresnerf.data.formats.simple.times_of_images import (
     number_of,
     times_of_images,
 )
-from biresnerf.data.formats.simple.trajectory_lines import IMAGES_OF, Trajectory
 from biresnerf.data.model.atomic_file import write_text
 from biresnerf.data.model.dataset import SourceFormat
 from biresnerf.data.model.image_order import names_of_poses
 from biresnerf.data.model.refined_set import RefinedSet
+from biresnerf.data.model.untrusted_file import finite_numbers, invalid_file, read_text
 from biresnerf.data.photos.photo_folders import few_names
 from biresnerf.errors import InputError
 from biresnerf.geometry.rigid import quat_wxyz_from_rotation
@@ -76,6 +83,85 @@ _PHOTO_FOLDERS = ("image_2", "image_0", "image_3", "image_1")  # KITTI's: the co
 _LEAST_CLOCK = 1e8  # s; smaller whole numbers in names count photos, as a rule
 _FRAME_RATE = 30  # at which MASt3R-SLAM takes photos of a folder; it writes poses of some
 _HEAD = "# timestamp tx ty tz qx qy qz qw: camera to world, OpenCV axes (x right, y down, z forward), the input's frame"
+IMAGES_OF = "{stem}_images.txt"  # beside our KITTI files, which have no room for names: an image a line
+_HINT = "Give lines of `time x y z qx qy qz qw` (TUM; without times, as many as images), or [R | t] by rows (KITTI)."
+_COLUMNS: dict[int, str] = {7: "tum", 8: "tum", 12: "kitti"}
+# What `refine` writes above its poses: which image was taken when.
+_NAMED_TIME = re.compile(r"#\s*([-+0-9.eE]+)\s+(\S.*\S|\S)\s*$")
+
+
+class Trajectory:
+    """Poses in the file's order, called by their images, times or numbers; bad ones of a file without times included.
+
+    ``times_s`` and the names of images by time are there where the file has them; ``left_out`` are bad lines, which
+    are no pose as they have a time or another number of words.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self.times_s: list[float] = []
+        self.name_of_time: dict[float, str] = {}
+        rows: list[tuple[str, list[str]]] = []
+        for number, line in enumerate(read_text(file).splitlines(), start=1):
+            words = line.replace(",", " ").split()
+            if not words or line.lstrip().startswith("#"):
+                self._note_name(line)
+            elif rows or not all(number_of(word) is None for word in words):  # else a header without its mark
+                rows.append((f"{file.name} line {number}", words))
+            if len(rows) > MAX_ROWS:
+                raise invalid_file(
+                    f"{file.name} line {number}", f"more than {MAX_ROWS} poses are not read.", _HINT
+                )
+        lengths = Counter(len(words) for _, words in rows if len(words) in _COLUMNS)
+        columns = lengths.most_common(1)[0][0] if lengths else 0
+        read = [entry_of(where, where, partial(_read, words, columns, where)) for where, words in rows]
+        timed = columns == 8
+        entries = [entry for entry in read if not timed or entry.problem is None]
+        self.left_out = [entry for entry in read if timed and entry.problem is not None]
+        if not any(entry.problem is None for entry in entries):
+            raise next(
+                (one.problem for one in read if one.problem), invalid_file(file.name, "holds no pose.", _HINT)
+            )
+        if timed:
+            words_at = dict(rows)
+            self.times_s = [float(words_at[entry.where][0]) for entry in entries]
+        self.dialect = _COLUMNS[columns]
+        self.image_names = [self.name_of_time.get(time, "") for time in self.times_s]
+        list_file = file.with_name(IMAGES_OF.format(stem=file.stem))
+        self.files = [file]
+        if not self.times_s and list_file.is_file():
+            self.files.append(list_file)
+            self.image_names = read_text(list_file).splitlines()
+            if len(self.image_names) != len(entries):
+                raise invalid_file(
+                    list_file.name, f"names {len(self.image_names)} images for {len(entries)} poses.", _HINT
+                )
+        if len(set(self.times_s)) != len(self.times_s):
+            raise invalid_file(file.name, "two poses have the same time.", _HINT)
+        called = self.image_names or [""] * len(entries)
+        others = [f"{time:.17g}" for time in self.times_s] or [str(index) for index in range(len(entries))]
+        self.entries = [
+            replace(entry, name=name or other)
+            for entry, name, other in zip(entries, called, others, strict=True)
+        ]
+
+    def _note_name(self, line: str) -> None:
+        match = _NAMED_TIME.match(line.strip())
+        time = number_of(match[1]) if match else None
+        if match and time is not None:
+            self.name_of_time[time] = match[2]
+
+
+def _read(words: list[str], columns: int, where: str) -> Placed:
+    if len(words) not in _COLUMNS or len(words) != columns:
+        raise invalid_file(
+            where, f"has {len(words)} numbers, not 8 or 7 (TUM) or 12 (KITTI) as every line.", _HINT
+        )
+    values = finite_numbers(words, where, _HINT)
+    if columns == 12:
+        return pose_by(KITTI, values.reshape(3, 4), where), None
+    x, y, z, *quaternion = values[-7:].tolist()
+    return pose_of_numbers(TUM, quaternion, (x, y, z), where, _HINT), None
 
 
 def parse_trajectory(root: Path, file: Path) -> ParsedPoses:

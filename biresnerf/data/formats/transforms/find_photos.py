@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from biresnerf.data.formats.bad_frames import attempt, good_frames, tolerate
+from biresnerf.data.formats.bad_frames import attempt, good_frames, missing_images
 from biresnerf.data.formats.match_names import ENDS, SAME_PATH, Rule, match_files
 from biresnerf.data.formats.parsed_poses import FrameCamera, PoseEntry
 from biresnerf.data.photos.image_files import ImageHeader, images_called
@@ -61,17 +61,8 @@ def find_photos(
             refuse_outside([file.parent / spelling], [first.name], within, f"{first.where}.file_path")
     missing = [entry for entry in entries if entry.name not in found]
     if missing:
-        listed = (
-            f"{len(missing)} of {len(entries)} images not found: {few_names(one.name for one in missing)}"
-        )
-        error = InputError(
-            "image_missing",
-            f"{listed}.",
-            where=f"{missing[0].where}.file_path",
-            hint=_where(file, missing[0], within),
-        )
-        tolerate(len(missing), len(entries), error, strict=strict)
-        notes.append(f"{listed}; their frames are left out")
+        where, hint = f"{missing[0].where}.file_path", _where(file, missing[0], within)
+        notes += missing_images([one.name for one in missing], len(entries), where, hint, strict=strict)
     pairs = [
         (path, _of_copy(path, file, entry))
         for entry in entries
