@@ -61,14 +61,12 @@ class OutputFolder:
             REPORT_HTML,
             CONFIG,
             HISTORY,
-            RENDERS,
-            REFINED,
-            BODY,
-            THUMBNAIL,
-            VIEW,
-            CONTACT_SHEET,
+            GEOREFERENCE,
+            LOG,
+            CHECKPOINT.parent.name,
+            PANORAMA_VIEWS,
         }
-        written |= {GEOREFERENCE, LOG, CHECKPOINT.parent.name, PANORAMA_VIEWS}
+        written |= {RENDERS, REFINED, BODY, THUMBNAIL, VIEW, CONTACT_SHEET}
         for name in {Path(file).parts[0] for file in written if file}:
             path = self.path / name
             if path.is_dir():

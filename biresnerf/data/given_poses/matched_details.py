@@ -22,10 +22,8 @@ SIDE = 320  # px that photos are shrunk to
 PHOTOS, RUNS = 24, 4  # that are looked at, in runs of neighbours: photos of one walk share details with these
 CORNERS = 250  # of a photo
 PAIRS, LEAST = 60, 8  # pairs with most details in common, each with at least so many
-_REACH, _SPACING = (
-    12,
-    3,
-)  # px from a corner to the edge of what it is compared by, and between two of its samples
+# Px from a corner to the edge of what it is compared by, and between two of its samples.
+_REACH, _SPACING = 12, 3
 _FLAT = 1.0  # corners whose weaker gradient, squared, is below this are noise; of 255²
 _ALIKE, _DISTINCT = 0.8, 0.85  # correlation, and distance as a share of that to the next one
 

@@ -54,6 +54,7 @@ DAMAGED: tuple[type[Exception], ...] = (
     *(OSError, SyntaxError, ValueError, EOFError, TypeError, KeyError, IndexError, OverflowError),
     *(AttributeError, MemoryError, RuntimeError, struct.error, zlib.error, Image.DecompressionBombError),
 )
+UNREADABLE: tuple[type[Exception], ...] = (InputError, *DAMAGED)
 
 T = TypeVar("T")
 
@@ -132,13 +133,8 @@ def is_image_name(path: Path) -> bool:
     return path.suffix.lower() in image_suffixes()
 
 
-def find_image(folder: Path, name: str) -> Path | None:
-    """The file ``name`` means in ``folder``: as written, with slashes turned, or with an extension."""
-    return next(iter(images_called(folder, name)), None)
-
-
 def images_called(folder: Path, name: str) -> list[Path]:
-    """The files that ``name`` may mean in ``folder``, that of `find_image` first.
+    """The files that ``name`` may mean in ``folder``: as written, with slashes turned, or with an extension.
 
     Of a JPEG and a PNG of one name, the PNG may be a mask or a depth: those in colour go first, then JPEG.
     """
@@ -189,9 +185,7 @@ def _greyness(path: Path, _mtime_ns: int, _size: int) -> int:
                 return 2
             red, green, blue = image.convert("RGB").split()
             return int(red.tobytes() == green.tobytes() == blue.tobytes())
-    except InputError:
-        return 0
-    except DAMAGED:
+    except UNREADABLE:
         return 0
 
 

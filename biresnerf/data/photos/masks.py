@@ -15,8 +15,8 @@ from biresnerf.data.model.dataset import Dataset, Frame
 from biresnerf.data.photos.decode import as_stored
 from biresnerf.data.photos.image_files import (
     DAMAGED,
-    find_image,
     header_of,
+    images_called,
     is_image_name,
     open_image,
     quiet_pillow,
@@ -107,15 +107,15 @@ def named_mask(file: Path, name: Any, where: str, within: Path | None = None) ->
         refuse_outside(
             [file.parent / name, file.parent / name.replace("\\", "/")], [name, name], within, where
         )
-    path = find_image(file.parent, name) if isinstance(name, str) else None
-    if path is None:
+    found = images_called(file.parent, name) if isinstance(name, str) else []
+    if not found:
         raise InputError(
             "mask_missing",
             "there is no such mask.",
             where=where,
             hint="Put the mask there (the path is relative to the file), or remove mask_path.",
         )
-    return path
+    return found[0]
 
 
 def _is_ready(candidate: Path, within: Path | None) -> bool:

@@ -23,34 +23,11 @@ _USUAL = ("rgb", "color", "colour", "image", "image_2", "image_0", "train")
 # Folders of the photos of images/ at a half, a quarter or so of their size, as LLFF and nerfstudio write them.
 COPIES = re.compile(rf"{IMAGE_FOLDER}_(\d+)")
 # Words by which programs call what they make of photos: maps and small copies, in files beside them or in folders.
-_MAPS = frozenset(
-    {
-        "mask",
-        "masks",
-        "matte",
-        "alpha",
-        "depth",
-        "depths",
-        "depthmap",
-        "depthmaps",
-        "disparity",
-        "disp",
-        "conf",
-    }
-    | {
-        "confidence",
-        "normal",
-        "normals",
-        "semantic",
-        "semantics",
-        "segmentation",
-        "seg",
-        "instance",
-        "label",
-        "labels",
-    }
-    | {"flow", "albedo", "roughness", "thumb", "thumbs", "thumbnail", "thumbnails", "preview"}
-)
+_MAPS = frozenset({
+    "mask", "masks", "matte", "alpha", "depth", "depths", "depthmap", "depthmaps", "disparity", "disp", "conf",
+    "confidence", "normal", "normals", "semantic", "semantics", "segmentation", "seg", "instance", "label", "labels",
+    "flow", "albedo", "roughness", "thumb", "thumbs", "thumbnail", "thumbnails", "preview",
+})  # fmt: skip
 # Other folders whose pictures are not the set's photos; `biresnerf convert` writes pinhole/.
 _NO_PHOTOS = frozenset({"pinhole", "sparse", "sparse_txt", "__macosx"})
 # Maps of something else beside a photo, as 7-Scenes, sdfstudio and instant-ngp name them.
@@ -59,19 +36,12 @@ _NO_PHOTO = re.compile(
 )
 # Pictures that are not read and videos, by their extension.
 _NO_PICTURES = {
-    **{
-        ".gif": "GIF",
-        ".jxl": "JPEG XL",
-        ".jxr": "JPEG XR",
-        ".psd": "Photoshop",
-        ".tga": "TGA",
-        ".svg": "SVG",
-    },
-    **{".pdf": "PDF", ".dcm": "DICOM", ".fits": "FITS", ".insp": "Insta360", ".dds": "DDS", ".xcf": "GIMP"},
+    ".gif": "GIF", ".jxl": "JPEG XL", ".jxr": "JPEG XR", ".psd": "Photoshop", ".tga": "TGA", ".svg": "SVG",
+    ".pdf": "PDF", ".dcm": "DICOM", ".fits": "FITS", ".insp": "Insta360", ".dds": "DDS", ".xcf": "GIMP",
     **dict.fromkeys((".jp2", ".j2k", ".j2c", ".jpf", ".jpx"), "JPEG 2000"),
     **dict.fromkeys((".ppm", ".pgm", ".pnm", ".pbm"), "PNM"),
     **dict.fromkeys(DEMUXERS, "video"),
-}
+}  # fmt: skip
 _MOST_ENTRIES = 100_000  # looked at for a message
 
 

@@ -135,9 +135,8 @@ def extract_features(request: dict[str, Any], database: Path, images: Path, extr
             database, images, image_names=camera["names"], camera_mode=pycolmap.CameraMode.SINGLE,
             reader_options=reader, extraction_options=extraction,
         )  # fmt: skip
-    opened = pycolmap.Database.open(database)
-    camera_of = {image.name: image.camera_id for image in opened.read_all_images()}
-    opened.close()
+    with pycolmap.Database.open(database) as opened:
+        camera_of = {image.name: image.camera_id for image in opened.read_all_images()}
     firsts = [camera["names"][0] if camera["names"] else "" for camera in request["cameras"]]
     return [camera_of.get(name, -1) for name in firsts]
 

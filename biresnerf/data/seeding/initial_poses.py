@@ -19,19 +19,13 @@ MOSTLY_MATCHED = 0.8  # share of the cameras from which on feature matches place
 DOUBTED = GUESSES | {"gimbal"}  # poses that need not agree with those of the other cameras
 GUESSED_MOST = 0.5  # of the cameras: with more guesses there is no field of others to agree with
 
-# Float64 [n, 4, 4]; in JSON a list of lists.
-PoseArray = Annotated[
-    NDArray[np.float64],
-    PlainValidator(lambda value: np.array(value, dtype=np.float64)),
-    PlainSerializer(lambda poses: poses.tolist()),
-]
-
-
-MaybePoseArray = Annotated[
-    NDArray[np.float64] | None,
+_IN_JSON = (
     PlainValidator(lambda value: None if value is None else np.array(value, dtype=np.float64)),
     PlainSerializer(lambda poses: None if poses is None else poses.tolist()),
-]
+)
+# Float64 [n, 4, 4]; in JSON a list of lists.
+PoseArray = Annotated[NDArray[np.float64], *_IN_JSON]
+MaybePoseArray = Annotated[NDArray[np.float64] | None, *_IN_JSON]
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,18 +15,16 @@ from biresnerf.data.model.atomic_file import whole_file, write_text
 from biresnerf.data.model.dataset import Dataset, Frame
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.photos.decode import as_stored
-from biresnerf.data.photos.image_files import DAMAGED, header_of, is_sixteen_bit, open_image, quiet_pillow
+from biresnerf.data.photos.image_files import UNREADABLE, header_of, is_sixteen_bit, open_image, quiet_pillow
 from biresnerf.data.photos.kinds.sixteen_bit import as_eight_bit
 from biresnerf.data.photos.orientation import turned
 from biresnerf.data.seeding.seeding_progress import SeedingProgress
-from biresnerf.errors import InputError
 from biresnerf.frozen_model import FrozenModel
 
 SEEDING_JSON, PHOTOS = "seeding.json", "photos.jpg"
 SHEET_COLUMNS, SHEET_MOST = 6, 36
 TILE, _GAP = 128, 4  # px
 _GROUND = (238, 238, 238)
-UNREADABLE: tuple[type[Exception], ...] = (InputError, *DAMAGED)
 
 
 class SeedingImage(FrozenModel):

@@ -100,14 +100,12 @@ def ramp_colours(values: NDArray[np.floating]) -> NDArray[np.uint8]:
     return np.rint(_RAMP[below] * (1 - share) + _RAMP[below + 1] * share).astype(np.uint8)
 
 
-def depth_picture(
-    depth: NDArray[np.floating], depth_range: tuple[float, float] | None = None
-) -> NDArray[np.uint8]:
-    """Colours uint8 [h, w, 3] of a depth map; the ramp ends at its 2nd and 98th percentile where no range is given."""
+def depth_picture(depth: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Colours uint8 [h, w, 3] of a depth map; the ramp ends at its 2nd and 98th percentile."""
     there = np.isfinite(depth) & (depth > 0)
     if not there.any():
         return np.broadcast_to(_NOTHING, (*depth.shape, 3)).copy()
-    near, far = depth_range or tuple(np.percentile(depth[there], [2.0, 98.0]))
+    near, far = np.percentile(depth[there], [2.0, 98.0])
     share = (np.where(there, depth, far) - near) / max(far - near, 1e-12)
     return np.where(there[..., None], ramp_colours(1.0 - share), _NOTHING)
 

@@ -19,9 +19,8 @@ from biresnerf.data.photos.guessed_lens import FILM_DIAGONAL_MM
 from biresnerf.data.photos.orientation import INVERSE, shown_from_stored, turned
 from biresnerf.geometry.earth.geodesy import place_of
 
-ORIGIN = np.array(
-    [46.5196, 6.6323, 420.0]
-)  # latitude, longitude (degrees) and height (m) of the scene's origin
+# Latitude, longitude (degrees) and height (m) of the scene's origin.
+ORIGIN = np.array([46.5196, 6.6323, 420.0])
 _TAKEN = datetime(2024, 5, 1, 10, 0, 0)
 _THUMBNAIL = (160, 120)
 _QUALITY = 95

@@ -24,9 +24,8 @@ from biresnerf.data.synthetic.scene import (
 from biresnerf.data.synthetic.shapes import Shape
 
 Array = NDArray[np.float32]
-Pattern = Callable[
-    [Array, Array], Array
-]  # points and normals [n, 3] in a shape's own frame -> colours [n, 3]
+# Points and normals [n, 3] in a shape's own frame -> colours [n, 3].
+Pattern = Callable[[Array, Array], Array]
 
 STILL_LIFE = (
     Shape("box", (0.0, 0.0, -0.50), (0.98, 0.84, 0.07), (8.0, 0.0)),

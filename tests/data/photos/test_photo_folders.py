@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from biresnerf.data.formats.read_dataset import read_dataset
-from biresnerf.data.photos.image_files import find_image
+from biresnerf.data.photos.image_files import images_called
 from biresnerf.data.photos.photo_folders import images_in
 from biresnerf.errors import InputError
 from tests.data.formats.simple import trajectories
@@ -62,7 +62,7 @@ def test_a_grey_picture_beside_a_photo_of_its_name_is_not_taken_for_it(tmp_path)
     Image.fromarray(np.zeros((20, 30), np.uint16)).save(tmp_path / "4.png")
     assert [path.name for path in images_in(tmp_path)] == ["1.jpg", "2.png", "3.jpg", "3.png", "4.jpg"]
     for name, file in (("1", "1.jpg"), ("2", "2.png"), ("3", "3.jpg"), ("4", "4.jpg")):
-        assert find_image(tmp_path, name) == tmp_path / file
+        assert images_called(tmp_path, name)[0] == tmp_path / file
 
 
 def test_a_mask_saved_in_colours_is_no_photo_either(tmp_path):

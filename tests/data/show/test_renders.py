@@ -40,7 +40,7 @@ def test_equal_pictures_have_no_difference_and_more_difference_is_brighter(tmp_p
 
 def test_near_is_bright_far_is_dark_and_nothing_is_black():
     depth = np.array([[1.0, 2.0, 3.0, np.inf, np.nan, 0.0]])
-    picture = depth_picture(depth, (1.0, 3.0))[0]
+    picture = depth_picture(depth)[0]
     assert picture[0].tolist() == [253, 231, 37]
     assert picture[2].tolist() == [68, 1, 84]
     assert (picture[3:] == 0).all()

@@ -33,9 +33,8 @@ _COLUMNS = {
     "zaccuracy": ("zaccuracy", "accuracyz", "verticalaccuracy", "sigmaz"),
 }
 FLAT = "as places alone, without heights, do not tell how the scene is tilted"
-_ODM_ACCURACY = (
-    7  # column of geo.txt's horizontal accuracy, after name, position and angles; the vertical one follows
-)
+# Column of geo.txt's horizontal accuracy, after name, position and angles; the vertical one follows.
+_ODM_ACCURACY = 7
 
 
 @dataclass(frozen=True)

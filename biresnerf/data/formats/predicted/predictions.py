@@ -66,10 +66,8 @@ _CAM_FROM_WORLD = ("extrinsic", "extrinsics")
 _WORLD_FROM_CAM = ("poses", "camera_poses", "cams2world", "cam2world", "cam2w", "c2w", "im_poses")
 _LENSES = ("intrinsic", "intrinsics", "K", "focals", "camera_focals", "focal")
 _CENTRES = ("pps", "camera_pps", "principal_points")
-_DEPTHS, _PICTURES = (
-    ("depth", "depths"),
-    ("images", "image", "imgs"),
-)  # either at the size that the lens is for
+# Either at the size that the lens is for.
+_DEPTHS, _PICTURES = ("depth", "depths"), ("images", "image", "imgs")
 _MOST_BYTES = 16 * 2**20
 _MOST_SMALL = 240  # px; the pictures of the smaller of DUSt3R's networks
 _HINT = "Give the file as the program wrote it, with poses [n, 4, 4] and a lens or a focal length for each."

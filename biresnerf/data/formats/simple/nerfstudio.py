@@ -45,9 +45,8 @@ NERFSTUDIO = Format(
 # What the parser reads; all of them, or none, at the top.
 _RADIAL = ("k1", "k2", "k3", "k4")
 _BROWN = (*_RADIAL, "p1", "p2")
-_LENSES = LensLimits(
-    "nerfstudio"
-)  # k4 of another lens than a fisheye is the rational model's, which it does not know
+# The k4 of another lens than a fisheye is the rational model's, which it does not know.
+_LENSES = LensLimits("nerfstudio")
 
 
 def write_nerfstudio(refined: RefinedSet, path: Path, dataset: Dataset | None = None) -> None:

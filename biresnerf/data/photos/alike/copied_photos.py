@@ -16,8 +16,8 @@ from PIL import Image
 from biresnerf.data.model.dataset import Dataset, Frame
 from biresnerf.data.model.part_of_set import LEAST, without_photos
 from biresnerf.data.photos.image_files import (
-    DAMAGED,
     EXIF_ORIENTATION,
+    UNREADABLE,
     from_exif,
     is_sixteen_bit,
     open_image,
@@ -25,7 +25,6 @@ from biresnerf.data.photos.image_files import (
 )
 from biresnerf.data.photos.orientation import turned, turned_size
 from biresnerf.data.photos.photo_folders import few_names
-from biresnerf.errors import InputError
 from biresnerf.geometry.pose_error import rotation_between_deg
 
 MOST_NAMED = 10
@@ -42,7 +41,6 @@ ASPECT = 0.01  # of width by height, which halving an odd number changes
 SAME_VIEW_DEG, SAME_VIEW = 0.5, 0.01
 _COARSE = 8  # cells of a side, whose means tell most pictures apart
 _DECODERS = 4
-_UNREADABLE: tuple[type[Exception], ...] = (InputError, *DAMAGED)
 
 
 def without_copies(dataset: Dataset, keep: Sequence[str] = ()) -> Dataset:
@@ -157,7 +155,7 @@ def _picture(frame: Frame) -> _Picture | None:
             drafted = image.draft("L", (LEAST_PX, LEAST_PX))
             box = (0, 0, width, height) if drafted is None else drafted[1]
             grey = image.convert("L").resize((LEAST_PX, LEAST_PX), Image.Resampling.BILINEAR, box=box)
-    except _UNREADABLE:
+    except UNREADABLE:
         return None  # whoever needs the picture says what is wrong with it
     cells = turned(_means(np.asarray(grey, np.float32), FINE), shown)
     down, right = np.gradient(cells)

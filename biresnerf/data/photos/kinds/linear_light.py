@@ -162,16 +162,8 @@ class RadianceFile(LinearFile):
 
         width, height = _radiance_size(path)
         command = [
-            *(
-                get_ffmpeg_exe(),
-                "-nostdin",
-                "-v",
-                "error",
-                "-threads",
-                "1",
-                "-protocol_whitelist",
-                "file,pipe",
-            ),
+            *(get_ffmpeg_exe(), "-nostdin", "-v", "error", "-threads", "1"),
+            *("-protocol_whitelist", "file,pipe"),
             *("-f", "image2", "-pattern_type", "none", "-c:v", "hdr", "-i", f"file:{path.absolute()}"),
             *("-frames:v", "1", "-f", "rawvideo", "-pix_fmt", "gbrpf32le", "-"),
         ]

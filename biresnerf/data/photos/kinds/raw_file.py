@@ -18,13 +18,7 @@ from biresnerf.data.photos.kinds.picture_file import PictureFile
 ORIENTATION, EXIF_IFD, FOCAL_LENGTH, GPS_IFD = 0x0112, 0x8769, 0x920A, 0x8825
 _ORIENTATION_OF = {0: 1, 3: 3, 5: 8, 6: 6}  # of LibRaw's ways to turn
 # A TIFF but for its number: Olympus and Panasonic. Their tables, as all makers', are near the start.
-_TIFF_HEADS = {
-    b"II*\0": b"II*\0",
-    b"MM\0*": b"MM\0*",
-    b"IIRO": b"II*\0",
-    b"IIRS": b"II*\0",
-    b"IIU\0": b"II*\0",
-}
+_TIFF_HEADS = {b"MM\0*": b"MM\0*", **dict.fromkeys((b"II*\0", b"IIRO", b"IIRS", b"IIU\0"), b"II*\0")}
 _TABLES = 4 << 20
 _SRGB_CURVE = (2.4, 12.92)
 

@@ -14,20 +14,17 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.data.photos.image_files import DAMAGED, open_image, quiet_pillow
-from biresnerf.errors import InputError
+from biresnerf.data.photos.image_files import UNREADABLE, open_image, quiet_pillow
 
 # The values that become black and white.
 Levels: TypeAlias = tuple[int, int]
 FULL: Levels = (0, 65535)
 # Of the full range: in photos of half their contrast COLMAP finds 34 to 55 % of the matches, of a quarter 3 to 22 %.
 SMALL = 0.5
-CUT = (
-    1e-3  # of the set's pixels are darker than black, and as many brighter than white: dead pixels, hot spots
-)
+# Of the set's pixels so many are darker than black, and as many brighter than white: dead pixels, hot spots.
+CUT = 1e-3
 _SAMPLES = 1 << 20  # values of each photo, at least, that are looked at
 _DECODERS = 4
-_UNREADABLE: tuple[type[Exception], ...] = (*DAMAGED, InputError)
 
 
 def levels_of_set(files: Sequence[Path]) -> Levels | None:
@@ -45,7 +42,7 @@ def _histogram(file: Path) -> NDArray[np.int64]:
             values = np.asarray(image).ravel()
         values = values[:: max(1, len(values) // _SAMPLES)]
         return np.bincount(values.clip(*FULL), minlength=FULL[1] + 1)
-    except _UNREADABLE:  # said when it is decoded for use
+    except UNREADABLE:  # said when it is decoded for use
         return np.zeros(FULL[1] + 1, dtype=np.int64)
 
 
