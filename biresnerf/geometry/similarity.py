@@ -54,13 +54,8 @@ class Similarity:
 
     def report(self) -> SimilarityReport:
         """The numbers for a report."""
-        return SimilarityReport.model_validate(
-            {
-                "scale": self.scale,
-                "rotation": self.rotation.tolist(),
-                "translation": self.translation.tolist(),
-            }
-        )
+        rotation, translation = self.rotation.tolist(), self.translation.tolist()
+        return SimilarityReport(scale=self.scale, rotation=rotation, translation=translation)
 
     def apply(self, x_in_a: Array) -> Array:
         """Points [..., 3] in a to points [..., 3] in b."""

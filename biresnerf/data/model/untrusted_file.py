@@ -1,4 +1,7 @@
-"""Files of unknown origin: bounded in size, text in UTF-8, numbers finite, JSON without duplicate keys."""
+"""Files of unknown origin: bounded in size, text in UTF-8, numbers finite, JSON without duplicate keys.
+
+XML is bounded, and without entities, so that nothing can expand.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +9,12 @@ import csv
 import json
 import math
 import re
+import xml.parsers.expat
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +26,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 # A table's head is one of so many lines, as other things may stand above, and names no more columns.
 HEAD_LINES, MOST_COLUMNS = 100, 1000
+_MAX_DEPTH, _MAX_ELEMENTS = 50, 500_000  # of XML
 MAX_TEXT_BYTES = 64 * 2**20  # some 100 000 frames; a larger file is no pose file
 
 
@@ -267,3 +273,30 @@ def checked(model: type[Model], value: object, where: str, hint: str, code: str 
         code = code or ("pose_not_finite" if not_finite else "pose_file_invalid")
         field = ".".join(str(part) for part in first["loc"])
         raise InputError(code, f"{first['msg']}.", where=f"{where} {field}".rstrip(), hint=hint) from None
+
+
+class _TreeBuilder(ElementTree.TreeBuilder):
+    """A tree that is neither too deep nor too large."""
+
+    depth = elements = 0
+
+    def start(self, tag: str, attrs: dict[str, str]) -> ElementTree.Element:
+        self.depth, self.elements = self.depth + 1, self.elements + 1
+        if self.depth > _MAX_DEPTH or self.elements > _MAX_ELEMENTS:
+            raise ElementTree.ParseError("nested too deeply, or too long")
+        return super().start(tag, attrs)
+
+    def end(self, tag: str) -> ElementTree.Element:
+        self.depth -= 1
+        return super().end(tag)
+
+
+def read_xml(file: Path, hint: str) -> ElementTree.Element:
+    """The root of the XML ``file``. Raises InputError ``pose_file_invalid``, also for document types and entities."""
+    text = read_text(file)
+    try:
+        if "<!DOCTYPE" in text or "<!ENTITY" in text:
+            raise ElementTree.ParseError("document types and entities are not read")
+        return ElementTree.fromstring(text, parser=ElementTree.XMLParser(target=_TreeBuilder()))
+    except (ElementTree.ParseError, xml.parsers.expat.ExpatError, ValueError) as error:
+        raise invalid_file(file.name, f"is no XML that is read: {error}.", hint) from None

@@ -143,15 +143,11 @@ def matched_pairs(database_path: Path) -> list[tuple[str, str, int]]:
     """Names of the images of each pair that matches, and how many matches."""
     import pycolmap
 
-    database = pycolmap.Database.open(database_path)
-    names = {image.image_id: image.name for image in database.read_all_images()}
-    found = []
-    for pair, geometry in zip(*database.read_two_view_geometries(), strict=True):
-        if len(geometry.inlier_matches) >= LEAST_MATCHES:
-            a, b = pycolmap.pair_id_to_image_pair(pair)
-            found.append((names[a], names[b], len(geometry.inlier_matches)))
-    database.close()
-    return found
+    with pycolmap.Database.open(database_path) as database:
+        names = {image.image_id: image.name for image in database.read_all_images()}
+        verified = list(zip(*database.read_two_view_geometries(), strict=True))
+    pairs = ((*pycolmap.pair_id_to_image_pair(pair), len(found.inlier_matches)) for pair, found in verified)
+    return [(names[a], names[b], count) for a, b, count in pairs if count >= LEAST_MATCHES]
 
 
 def drop_contradicting_pairs(database_path: Path, cam_from_world: dict[str, Any]) -> None:

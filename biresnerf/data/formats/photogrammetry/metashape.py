@@ -26,9 +26,8 @@ from biresnerf.data.formats.colmap.model_checks import (
     unsupported,
 )
 from biresnerf.data.formats.parsed_poses import ParsedPoses
-from biresnerf.data.formats.photogrammetry.xml_file import read_xml
 from biresnerf.data.formats.pose_rows import Placed, parsed_rows, pose_by, shear_of, without_skew
-from biresnerf.data.model.untrusted_file import finite_numbers, invalid_file
+from biresnerf.data.model.untrusted_file import finite_numbers, invalid_file, read_xml
 from biresnerf.data.photos.panoramas.panorama import panorama_camera
 from biresnerf.data.photos.photo_folders import few_names
 from biresnerf.errors import InputError

@@ -28,11 +28,17 @@ from biresnerf.data.formats.codec import Codec, LensLimits, cannot_hold, head_ho
 from biresnerf.data.formats.colmap.model_checks import listed_name, unsupported
 from biresnerf.data.formats.parsed_poses import LensOf, ParsedPoses
 from biresnerf.data.formats.photogrammetry.views import pose_of_centre
-from biresnerf.data.formats.photogrammetry.xml_file import read_xml
 from biresnerf.data.formats.pose_rows import Placed, at_size_of, lens_of_shares, parsed_rows, pose_by
 from biresnerf.data.model.atomic_file import write_text
 from biresnerf.data.model.refined_set import RefinedSet
-from biresnerf.data.model.untrusted_file import Table, finite_numbers, invalid_file, read_table, read_text
+from biresnerf.data.model.untrusted_file import (
+    Table,
+    finite_numbers,
+    invalid_file,
+    read_table,
+    read_text,
+    read_xml,
+)
 from biresnerf.geometry.camera.camera_models import FullParameters
 from biresnerf.geometry.rigid import rotation_about
 from biresnerf.options.formats import Format
