@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from biresnerf.data.formats.colmap.model_checks import rig_of_sensors
 from biresnerf.data.formats.datasets.euroc import _read_sensor
 from biresnerf.data.formats.match_names import match_files
 from biresnerf.data.formats.positions import control_points as control_points_module
@@ -100,6 +101,13 @@ def test_points_of_many_names_are_looked_up_not_compared_with_each(
     Name.compared = 0
     control_points(dataset)
     assert Name.compared < 50 * len(rows)
+
+
+def test_sensors_of_a_rig_are_looked_up_not_compared_with_each() -> None:
+    sensors = [((Name("CAMERA"), number), None) for number in range(1000)]
+    Name.compared = 0
+    rig_of_sensors(1, sensors, "rigs.bin rig 1")
+    assert Name.compared < 50 * len(sensors)
 
 
 def test_a_name_of_thousands_of_digits_is_one_that_no_photo_has() -> None:

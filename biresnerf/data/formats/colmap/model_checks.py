@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import posixpath
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -51,8 +52,8 @@ def rig_of_sensors(
 ) -> colmap.ColmapRig:
     """The rig of these sensors with ``sensor_from_rig``; the first is the reference. Each may be listed once."""
     names = [sensor for sensor, _ in sensors]
-    for index, (kind, sensor_id) in enumerate(names):
-        if (kind, sensor_id) in names[:index]:
+    for (kind, sensor_id), count in Counter(names).items():
+        if count > 1:
             raise broken(where, f"the sensor {kind} {sensor_id} is listed twice")
     return colmap.ColmapRig(number, names[0] if names else None, dict(sensors[1:]))
 
