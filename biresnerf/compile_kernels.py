@@ -32,8 +32,7 @@ from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.refinement.adjustment.adjustment import adjust_poses, misfit
 from biresnerf.refinement.adjustment.evidence import Evidence, PatchPhotos, PosePrior
 from biresnerf.refinement.adjustment.patch_points import Surfaces, find_patches
-from biresnerf.refinement.kernels.batch_errors import add_errors
-from biresnerf.refinement.kernels.draw_pixels import draw_pixels
+from biresnerf.refinement.kernels.batches import add_errors, draw_pixels
 from biresnerf.refinement.numbers.finish import EvidenceNumbers
 from biresnerf.refinement.optimise.pixel_chances import PixelChances
 from biresnerf.refinement.optimise.renderer import cast_rays, viewing_directions

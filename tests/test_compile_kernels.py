@@ -48,7 +48,7 @@ def test_an_adjustment_of_cameras_and_lenses_compiles_nothing_more():
     assert compiled() == before
 
 
-@pytest.mark.parametrize("first", ["biresnerf.resume", "biresnerf.refinement.kernels.draw_pixels"])
+@pytest.mark.parametrize("first", ["biresnerf.resume", "biresnerf.refinement.kernels.batches"])
 def test_kernels_are_found_in_the_cache_whichever_module_loads_numba(first):
     """The cache is asked for a processor, and Numba reads which one when it meets its first kernel."""
     program = f"""

@@ -178,13 +178,13 @@ class PosePrior:
         world_from_cam: [n, 4, 4].
         rotation: rad [n], of each component of the rotation vector. Infinite: not known. Zero: the camera is fixed.
         position: [n], of each coordinate, in the poses' unit.
-        bodies: cameras that move as one, and cameras that are fixed as well; None where each moves independently.
+        bodies: cameras that move as one, and cameras that are fixed as well.
     """
 
     world_from_cam: Array
     rotation: Array
     position: Array
-    bodies: RigidBodies | None = None
+    bodies: RigidBodies
 
     @classmethod
     def equal(
@@ -192,17 +192,11 @@ class PosePrior:
     ) -> PosePrior:
         """All cameras known equally well."""
         n = len(world_from_cam)
-        return cls(world_from_cam, np.full(n, rotation), np.full(n, position), bodies)
+        free = bodies or RigidBodies.free(n)
+        return cls(world_from_cam, np.full(n, rotation), np.full(n, position), free)
 
     @property
     def fixed(self) -> NDArray[np.bool_]:
         """Cameras [n] that are known exactly, or move as one with such a camera."""
         exact = (self.rotation <= 0) | (self.position <= 0)
-        if self.bodies is None:
-            return exact
         return np.isin(self.bodies.of, self.bodies.of[exact | self.bodies.fixed])
-
-    @property
-    def fixed_bodies(self) -> RigidBodies | None:
-        """The bodies with all cameras fixed that cannot move."""
-        return None if self.bodies is None else RigidBodies(self.bodies.of, self.fixed)

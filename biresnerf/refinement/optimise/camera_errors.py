@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from biresnerf.data.photos.images import ImageSet
-from biresnerf.refinement.kernels.batch_errors import add_errors
+from biresnerf.refinement.kernels.batches import add_errors
 from biresnerf.refinement.numbers.optimise import ErrorNumbers
 
 MAD_TO_DEVIATION = 1.4826
@@ -135,14 +135,12 @@ class CameraErrors:
 
     def _weigh(self) -> None:
         """Weigh lost cameras less: they must not fog the field where they wrongly stand."""
-        before, self.weights = self.weights, None
+        self.weights = None
         if bool(self.lost.any()):
             known = self.errors.isfinite()
             weights = torch.where(known, 1 / self.relative.clamp(min=1), torch.ones_like(self.errors))
             weights = torch.where(self.doubted, weights.clamp(max=self._numbers.doubted_weight), weights)
-            weights = torch.where(self.lost, weights, torch.ones_like(weights))
-            # In its place, as recorded steps read it.
-            self.weights = weights if before is None else before.copy_(weights)
+            self.weights = torch.where(self.lost, weights, torch.ones_like(weights))
 
     def doubt(self, cameras: np.ndarray) -> None:
         """Mark cameras (mask [n]) with guessed poses: they begin with little weight, and as suspects."""

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from biresnerf.data.photos.area_resize import area_resize
 from biresnerf.data.photos.images import ImageSet
-from biresnerf.refinement.kernels.draw_pixels import draw_pixels
+from biresnerf.refinement.kernels.batches import draw_pixels
 from biresnerf.refinement.optimise.pixel_chances import PixelChances
 
 PYRAMID_LEVELS = 5

@@ -7,6 +7,7 @@ import torch
 from scipy.optimize import least_squares
 
 from biresnerf.data.points.tracks import Tracks
+from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.geometry.similarity import Similarity
 from biresnerf.refinement.adjustment.adjustment import adjust_poses, misfit
 from biresnerf.refinement.adjustment.cameras import Cameras
@@ -178,7 +179,9 @@ def test_fixed_cameras_stay_and_the_others_come_to_them(rng):
     start = disturbed(truth, rng, 0.01, 0.03)
     start[:3] = truth[:3]
     known = np.r_[np.zeros(3), np.full(9, 0.1)]
-    found = adjust_poses(start, evidence, PosePrior(start, known, known)).world_from_cam
+    found = adjust_poses(
+        start, evidence, PosePrior(start, known, known, RigidBodies.free(len(start)))
+    ).world_from_cam
     np.testing.assert_allclose(found[:3], truth[:3], atol=1e-9)
     assert np.abs(found - truth).max() < 5e-3
 

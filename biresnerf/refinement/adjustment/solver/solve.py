@@ -33,13 +33,13 @@ class Prior:
         mean: the cameras before.
         weight: inverse variances [u]; zero where nothing is known.
         free: which of the u = 6n + 8g unknowns may move.
-        bodies: of the cameras, where some are fixed or move as one.
+        bodies: of the cameras, with all fixed that cannot move.
     """
 
     mean: Cameras
     weight: Array
     free: NDArray[np.bool_]
-    bodies: RigidBodies | None = None
+    bodies: RigidBodies
 
     @classmethod
     def of(cls, prior: PosePrior, lenses: Lenses | None = None) -> Prior:
@@ -50,7 +50,9 @@ class Prior:
             free = np.concatenate([free, lenses.free.reshape(-1)])
         usable = np.isfinite(deviation) & (deviation > 0)
         weight = np.where(usable, 1 / np.where(usable, deviation, 1.0) ** 2, 0.0)
-        return cls(Cameras.of(prior.world_from_cam, lenses), weight, free, prior.fixed_bodies)
+        return cls(
+            Cameras.of(prior.world_from_cam, lenses), weight, free, RigidBodies(prior.bodies.of, prior.fixed)
+        )
 
     def cost(self, cameras: Cameras) -> float:
         return float((self.weight * cameras.apart(self.mean) ** 2).sum())
@@ -61,13 +63,13 @@ class Prior:
 
     def moves(self, cameras: Cameras) -> BodyMoves | None:
         """How cameras follow bodies; None where each is free for itself."""
-        if self.bodies is None or not self.bodies.shared:
+        if not self.bodies.shared:
             return None
         return BodyMoves.among(cameras, self.bodies)
 
     def rigid(self, cameras: Cameras, motion: Array) -> Array:
         """An increment [u] along `moves`, with bodies rigid to more than first order."""
-        if self.bodies is None or not self.bodies.shared:
+        if not self.bodies.shared:
             return motion
         poses, lenses = cameras.split(motion)
         return np.concatenate([rigid_motion(cameras, self.bodies, poses).reshape(-1), lenses.reshape(-1)])
