@@ -20,6 +20,7 @@ LINT_IMPORTS = Path(sys.executable).with_name("lint-imports")
 # What a package is imported as, where that is not what it is installed as.
 IMPORTED_AS = {
     "opencv-python-headless": {"cv2"},
+    "opentelemetry-api": {"opentelemetry"},
     "opentelemetry-sdk": {"opentelemetry"},
     "pillow": {"PIL"},
     "pydantic": {"pydantic", "pydantic_core"},  # its own, which it pins

@@ -242,7 +242,7 @@ class Counting:
         artifacts = await self.stores.jobs.artifacts(self.id)
         assert {item.name for item in artifacts} == {"log.txt", "renders/one.png", "report.json"}
         assert len({item.key.split("/")[3] for item in artifacts}) == 1
-        sequence = [event.seq for event in await self.stores.jobs.events(self.id)]
+        sequence = [event.seq for event in (await self.stores.jobs.update(self.id)).events]
         assert sequence == list(range(1, len(sequence) + 1))
 
     async def until(self, holds: Callable[[JobView], bool], timeout_s: float = PATIENCE_S) -> JobView:
@@ -273,7 +273,7 @@ class Counting:
         )
 
     async def events(self) -> list[str]:
-        return [event.type for event in await self.stores.jobs.events(self.id)]
+        return [event.type for event in (await self.stores.jobs.update(self.id)).events]
 
     async def result(self) -> dict[str, object]:
         """The published report, read from the store."""

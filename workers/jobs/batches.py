@@ -16,7 +16,7 @@ from workers.jobs.jobs import JobStore
 from workers.jobs.quotas import submitting_for
 from workers.records import record_from_row
 from workers.settings.errors import Conflict
-from workers.settings.traces import traced
+from workers.settings.traces import TRACER
 from workers.tenants.tenants import LOCAL_TENANT
 from workers.webhooks.webhooks import add_webhook
 
@@ -28,7 +28,7 @@ class Batches(JobStore):
         super().__init__(jobs._database, jobs._listener, jobs._settings)
         self._tenant, self._key_id = jobs._tenant, jobs._key_id
 
-    @traced("submit batch")
+    @TRACER.start_as_current_span("submit batch")
     async def submit_batch(
         self, asked: NewBatch, *, idempotency_key: str | None = None
     ) -> tuple[BatchView, bool]:

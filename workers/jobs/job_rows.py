@@ -107,8 +107,8 @@ async def known_job(
     return None if row is None else job_from_row(row)
 
 
-async def events_of(connection: Connection, job_id: str, after: int, limit: int) -> tuple[JobEvent, ...]:
+async def events_of(connection: Connection, job_id: str, after: int) -> tuple[JobEvent, ...]:
     """The job's history after ``seq == after``."""
     select = "SELECT seq, at, attempt, type, data FROM job_events WHERE job_id = %s AND seq > %s"
-    rows = await connection.rows(f"{select} ORDER BY seq LIMIT %s", job_id, after, limit)
+    rows = await connection.rows(f"{select} ORDER BY seq LIMIT 10000", job_id, after)
     return tuple(map(JobEvent.model_validate, rows))

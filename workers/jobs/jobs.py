@@ -13,7 +13,7 @@ from psycopg.types.json import Jsonb
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.wire.base import Page
 from biresnerf.wire.deliveries import DeliverTo
-from biresnerf.wire.jobs import JobDetails, JobEvent, JobState, JobTexts, JobView, LogLine, NewJob
+from biresnerf.wire.jobs import JobDetails, JobState, JobTexts, JobView, LogLine, NewJob
 from workers.database.database import Connection, Database, OwnedStore
 from workers.database.ids import new_id
 from workers.jobs.deadlines import limit_columns
@@ -44,7 +44,7 @@ from workers.records import (
 )
 from workers.settings.errors import Conflict
 from workers.settings.settings import Settings
-from workers.settings.traces import traced
+from workers.settings.traces import TRACER
 from workers.tenants.tenants import LOCAL_TENANT
 from workers.webhooks.webhooks import add_webhook
 
@@ -66,7 +66,7 @@ class JobStore(OwnedStore):
         bound._key_id = key_id
         return bound
 
-    @traced("submit")
+    @TRACER.start_as_current_span("submit")
     async def submit(
         self,
         dataset_id: str,
@@ -211,12 +211,6 @@ class JobStore(OwnedStore):
                 )
             await delete_job(connection, job_id)
 
-    async def events(self, job_id: str, *, after: int = 0, limit: int = 1000) -> tuple[JobEvent, ...]:
-        """The history after ``seq == after``, gapless and in order; raises `NotFound`."""
-        async with self._database.transaction() as connection:
-            await self._required(connection, job_id)
-            return await events_of(connection, job_id, after, limit)
-
     async def artifacts(self, job_id: str) -> tuple[Artifact, ...]:
         """The published files, by name, with those of its exports; while the job runs its previews.
 
@@ -247,7 +241,7 @@ class JobStore(OwnedStore):
         async with self._database.transaction() as connection:
             await connection.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ")
             job = job_from_row(await self._required(connection, job_id))
-            return JobUpdate(job=job, events=await events_of(connection, job_id, after, 10_000))
+            return JobUpdate(job=job, events=await events_of(connection, job_id, after))
 
     def subscribe(
         self, job_id: str, *, after: int = 0, heartbeat_s: float = 15.0
@@ -276,10 +270,6 @@ class JobStore(OwnedStore):
             f"SELECT state, count(*) AS n FROM jobs WHERE {MINE} GROUP BY state", self._tenant
         )
         return {row["state"]: row["n"] for row in rows}
-
-    async def healthy(self) -> bool:
-        """Whether the database answers in time."""
-        return await self._listener.database_answers(2.0)
 
     async def _required(self, connection: Connection, job_id: str) -> dict[str, Any]:
         sql = JOB + f" WHERE id = %s AND {MINE}"

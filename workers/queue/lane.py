@@ -18,7 +18,7 @@ from workers.database import job_queue
 from workers.database.database import Database
 from workers.database.job_queue import Entry
 from workers.database.notifications import Listener
-from workers.jobs.claim import Claim, Fenced, cancel_requested, claim_job, input_bytes
+from workers.jobs.claim import Fenced, cancel_requested, claim_job, input_bytes
 from workers.jobs.job_states import say_what_it_waits_for
 from workers.process.disk_space import job_disk_budget
 from workers.process.exit_status import ExitStatus
@@ -128,7 +128,8 @@ class Lane:
         attempt = Attempt(self._database, place.files, self._settings, claim, folder, place.variables)
         watching = asyncio.create_task(self._stop_when_asked(entry, attempt))
         try:
-            return await self._traced(attempt, claim)
+            with span("attempt", parent=claim.trace, about={"job": claim.job_id, "number": claim.attempt}):
+                return await attempt.run()
         finally:
             watching.cancel()
 
@@ -156,11 +157,3 @@ class Lane:
             log.warning("the job waits for disk space: %s", full.detail)
             return False
         return True
-
-    async def _traced(self, attempt: Attempt, claim: Claim) -> Ending:
-        """Run the attempt, as part of the trace of its submission."""
-        if self._settings.traces == "off":
-            return await attempt.run()
-        about_it: dict[str, str | int] = {"job": claim.job_id, "number": claim.attempt}
-        with span("attempt", parent=claim.trace, about=about_it):
-            return await attempt.run()

@@ -214,7 +214,7 @@ async def test_a_filled_database_of_the_first_release_goes_on_in_this_version(
         new, _ = await stores.jobs.submit("ds_local", RefineOptions(preset="fast"))
         assert await ends(stores, tmp_path, new.id) == {new.id: "succeeded"}
         for name in (*going_on, new.id):
-            numbers = [event.seq for event in await stores.jobs.events(name)]
+            numbers = [event.seq for event in (await stores.jobs.update(name)).events]
             assert numbers == list(range(1, len(numbers) + 1))
         # A checkpoint that the first version left in the row of an ended job.
         async with asyncio.timeout(60):

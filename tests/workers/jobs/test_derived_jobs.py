@@ -82,7 +82,7 @@ async def test_a_real_job_is_forked_and_exported(database_url: str, tmp_path: Pa
         of_body, new = await derived.export(first.id, ["kitti"], "body")
         assert (new, of_body.options) == (True, {"formats": ["kitti"], "poses_of": "body"})
         await over(stores, fork, tmp_path)
-        stages = [e.data["stage"] for e in await stores.jobs.events(fork.id) if e.type == "stage"]
+        stages = [e.data["stage"] for e in (await stores.jobs.update(fork.id)).events if e.type == "stage"]
         assert "fine" in stages
         assert "coarse" not in stages
         reports = [json.loads(await read(stores, job.id, "report.json")) for job in (first, fork)]

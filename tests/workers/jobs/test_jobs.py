@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 
 import psycopg
 import pytest
@@ -137,7 +136,7 @@ async def test_a_queued_job_is_cancelled_at_once_and_never_runs(
     assert (await stores.jobs.cancel(job.id)).revision == cancelled.revision, "a second time changes nothing"
     slots.start(settings, "a")
     await asyncio.sleep(1.5)
-    assert [event.type for event in await stores.jobs.events(job.id)] == ["queued", "cancelled"]
+    assert [event.type for event in (await stores.jobs.update(job.id)).events] == ["queued", "cancelled"]
 
 
 async def test_only_final_jobs_are_deleted_and_their_files_follow(
@@ -187,12 +186,3 @@ async def test_a_transaction_that_falls_silent_gives_its_locks_back(settings: Se
         with pytest.raises(Unavailable):
             await fall_silent(silent, other)
         assert await silent.fetch("SELECT 1 AS one") == [{"one": 1}], "a new transaction is possible"
-
-
-async def test_healthy_tells_whether_the_database_answers(stores: Stores):
-    assert await stores.jobs.healthy()
-    assert await stores.files.healthy()
-    assert await stores.jobs.counts() == {}
-    with contextlib.suppress(Unavailable):
-        await stores.jobs._database.pool.close()
-    assert not await stores.jobs.healthy()

@@ -39,7 +39,7 @@ async def ledger(stores: Stores, database: Database) -> Ledger:
 
 
 async def events(stores: Stores, ledger: Ledger) -> list[str]:
-    return [event.type for event in await stores.jobs.events(ledger.claim.job_id)]
+    return [event.type for event in (await stores.jobs.update(ledger.claim.job_id)).events]
 
 
 async def trash(database: Database) -> set[str]:
@@ -119,7 +119,7 @@ async def test_a_flood_of_checkpoints_does_not_fill_the_history(
     assert (seen.stage, seen.revision) == ("coarse", before.revision + 8), "clients see every change"
     assert await events(stores, ledger) == ["queued", "started", "checkpoint", "checkpoint"]
     assert await ledger.publish([FILE], None)
-    history = await stores.jobs.events(ledger.claim.job_id)
+    history = (await stores.jobs.update(ledger.claim.job_id)).events
     assert (history[-1].type, history[-1].seq) == ("succeeded", 5)
 
 

@@ -89,7 +89,7 @@ async def test_a_running_job_ends_at_its_deadline_with_its_best_poses(
     assert set(left) == {"log.txt", "poses.json", "report.json"}
     assert (await content(counting.stores, left["report.json"]))["state"] == "partial"
     assert ("previews" in left["poses.json"].key) == (fault is not None)
-    events = await counting.stores.jobs.events(counting.id)
+    events = (await counting.stores.jobs.update(counting.id)).events
     (asked,) = [event for event in events if event.type == "cancel_requested"]
     assert asked.data == {"code": "deadline_passed"}
     assert events[-1].data | {"detail": ""} == {"code": "deadline_passed", "partial": True, "detail": ""}
@@ -166,7 +166,7 @@ async def test_whoever_sees_it_first_ends_an_overdue_job_once(
     assert job.state == ("cancelled" if begun else "expired")
     assert job.error is not None
     assert job.error.code == "deadline_passed"
-    ends = [event.type for event in await stores.jobs.events(job_id) if event.type == job.state]
+    ends = [event.type for event in (await stores.jobs.update(job_id)).events if event.type == job.state]
     assert ends == [job.state]
     (entry,) = await database.fetch("SELECT state FROM queue_entries WHERE job_id = %s", job_id)
     assert entry["state"] not in ("todo", "doing")

@@ -181,7 +181,7 @@ async def test_a_claim_whose_acknowledgement_was_lost_counts_once(
     await taken_by_somebody(database)
     assert await claimed(database, job_id) == lost[0]
     assert (await stores.jobs.get(job_id)).attempt == 1
-    assert [event.type for event in await stores.jobs.events(job_id)] == ["queued", "started"]
+    assert [event.type for event in (await stores.jobs.update(job_id)).events] == ["queued", "started"]
 
 
 async def test_a_machine_that_slept_takes_no_job_from_its_workers(

@@ -79,7 +79,9 @@ async def test_kill_9_of_the_job_process_resumes_from_the_checkpoint(
     job = await counting.until_final()
     assert (job.state, job.attempt) == ("succeeded", 2)
     assert counting.starts()[1]["from"] >= 10
-    (crash,) = [e for e in await counting.stores.jobs.events(counting.id) if e.type == "attempt_crashed"]
+    (crash,) = [
+        e for e in (await counting.stores.jobs.update(counting.id)).events if e.type == "attempt_crashed"
+    ]
     assert crash.data["how"] == "exit status -9"
     assert "counting from 0" in crash.data["log_tail"]
     await counting.assert_one_result(60)

@@ -120,7 +120,9 @@ async def test_a_job_without_memory_is_tried_once_more_with_less(
     job = await counting.until_final()
     assert (job.state, job.attempt) == ("succeeded", 2)
     assert (job.resolved_options["max_image_size"], job.smaller["max_image_size"]) == (64, 64)
-    (again,) = [e for e in await counting.stores.jobs.events(counting.id) if e.type == "retried_smaller"]
+    (again,) = [
+        e for e in (await counting.stores.jobs.update(counting.id)).events if e.type == "retried_smaller"
+    ]
     assert again.data["options"] == job.smaller
     await counting.submit(10, 0.02, hungry=10)
     job = await counting.until_final()
@@ -153,7 +155,7 @@ async def test_a_process_killed_while_the_kernel_counts_a_kill_ran_out_of_memory
         f"here = pathlib.Path({str(tmp_path)!r});"
         "real = memory.OomKills.__init__;"
         "memory.OomKills.__init__ = lambda self: real(self, here, here);"
-        "sys.argv = ['slot', '--slot', 'a']; sys.exit(slot.main())"
+        "sys.exit(slot.run_slot('a'))"
     )
     slots.run(settings, [sys.executable, "-c", program], tmp_path / "slot.log")
     await counting.submit(10, 0.02, die_at=3, oom_counter=str(counter))

@@ -180,7 +180,7 @@ async def test_a_real_job_survives_the_kill_of_its_process(
         done = await watched.until_final(timeout_s=120)
         assert done.error is None
         assert (done.state, done.attempt) == ("succeeded", 2)
-        events = await stores.jobs.events(job.id)
+        events = (await stores.jobs.update(job.id)).events
         assert [e.data["resumed"] for e in events if e.type == "started"] == [False, True]
         stages = [e.data["stage"] for e in events if e.type == "stage" and e.attempt == 2]
         assert stages[0] == "preparing"

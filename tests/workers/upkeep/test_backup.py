@@ -122,7 +122,7 @@ async def test_after_backup_wipe_and_restore_jobs_and_results_are_back_and_work_
                 counting.stores = stores
                 assert (await counting.until_final(90)).state == "succeeded"
             assert int(running_job.starts()[-1]["from"]) >= 10, "it went on from its checkpoint"
-            assert [event.type for event in await stores.jobs.events(done.id)][-1] == "succeeded"
+            assert [event.type for event in (await stores.jobs.update(done.id)).events][-1] == "succeeded"
 
 
 async def test_the_next_backup_takes_what_is_new_and_drops_what_was_deleted(home: Path):

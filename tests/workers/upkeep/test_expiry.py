@@ -87,7 +87,7 @@ async def test_a_result_goes_when_its_time_is_over_and_the_log_proves_it(
     assert await stores.files.list(f"jobs/{old}") == []
     with pytest.raises(Expired):
         await stores.jobs.artifacts(old)
-    last = (await stores.jobs.events(old))[-1]
+    last = (await stores.jobs.update(old)).events[-1]
     assert (last.type, last.data) == ("files_expired", {"files": 2, "bytes": 5})
     assert f"deleted jobs/{old}: 2 files, 5 bytes; none is left" in caplog.text
     other = await stores.jobs.get(young)
@@ -276,7 +276,7 @@ async def test_two_dispatchers_expire_each_thing_once(stores: Stores, settings: 
     stop.set()
     await asyncio.gather(*working)
     for job_id in jobs:
-        assert [event.type for event in await stores.jobs.events(job_id)].count("files_expired") == 1
+        assert [event.type for event in (await stores.jobs.update(job_id)).events].count("files_expired") == 1
 
 
 async def all_expired(stores: Stores, jobs: list[str]) -> bool:
