@@ -79,11 +79,3 @@ class Listener:
     def _wake(self, subject: str) -> None:
         for event in self._waiting.get(subject, ()):
             event.set()
-
-    async def database_answers(self, timeout_s: float) -> bool:
-        """Whether a query comes back in time."""
-        try:
-            await asyncio.wait_for(self._database.fetch("SELECT 1"), timeout_s)
-        except (Unavailable, TimeoutError):
-            return False
-        return True
