@@ -61,33 +61,21 @@ async def open_stores(settings: Settings) -> AsyncIterator[Stores]:
         listening = asyncio.create_task(listener.run())
         try:
             given = settings.share_key
-            share_key = given.encode() if given else await _share_key(database)
-            jobs = JobStore(database, listener, settings)
-            monitor = Monitor(database, files, settings.stall_s)
-            uploads = UploadStore(database, files, settings)
             tenants = TenantStore(database)
             await tenants.apply_defaults(settings)
-            datasets = DatasetStore(database, files, settings)
-            webhooks = WebhookStore(database, settings)
-            keys = KeyStore(database)
-            janitor = Janitor(database, files, settings)
-            buckets = TokenBuckets(database)
-            links = ResultLinkStore(database)
             yield Stores(
-                *(
-                    jobs,
-                    datasets,
-                    files,
-                    uploads,
-                    keys,
-                    buckets,
-                    tenants,
-                    monitor,
-                    webhooks,
-                    janitor,
-                    share_key,
-                ),
-                links=links,
+                jobs=JobStore(database, listener, settings),
+                datasets=DatasetStore(database, files, settings),
+                files=files,
+                uploads=UploadStore(database, files, settings),
+                keys=KeyStore(database),
+                buckets=TokenBuckets(database),
+                tenants=tenants,
+                monitor=Monitor(database, files, settings.stall_s),
+                webhooks=WebhookStore(database, settings),
+                janitor=Janitor(database, files, settings),
+                share_key=given.encode() if given else await _share_key(database),
+                links=ResultLinkStore(database),
             )
         finally:
             listening.cancel()
