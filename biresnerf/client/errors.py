@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import email.utils
-import time
 from collections.abc import Mapping
 
 from pydantic import ValidationError
@@ -11,6 +9,7 @@ from pydantic import ValidationError
 from biresnerf.errors import BiresnerfError, FaultError
 from biresnerf.wire.jobs import JobView
 from biresnerf.wire.problems import FieldProblem, Problem
+from biresnerf.wire.retry_after import retry_after_s
 
 # Statuses that ask to try again later.
 _LATER = frozenset({408, 429, 502, 503, 504, 507})
@@ -114,16 +113,3 @@ class JobNotOver(BiresnerfError, TimeoutError):
     def __init__(self, job_id: str, timeout_s: float) -> None:
         self.job_id, self.timeout_s = job_id, timeout_s
         super().__init__(f"The job {job_id} is not over after {timeout_s:g} s; it continues.")
-
-
-def retry_after_s(header: str | None) -> float | None:
-    """The seconds in a Retry-After header, which holds a number or a date; None for anything else."""
-    if header is None:
-        return None
-    if header.strip().isdecimal():
-        return float(header)
-    try:
-        at = email.utils.parsedate_to_datetime(header)
-    except ValueError:
-        return None
-    return max(0.0, at.timestamp() - time.time())

@@ -8,8 +8,8 @@ import time
 import pytest
 
 from biresnerf.client import ServiceError
-from biresnerf.client.errors import retry_after_s
 from biresnerf.client.retries import Retries, RetryPolicy
+from biresnerf.wire.retry_after import retry_after_s
 
 
 def test_retry_after_is_seconds_or_a_date() -> None:

@@ -13,15 +13,13 @@ import logging
 import re
 import secrets
 import time
+from collections.abc import AsyncIterator
 from typing import Any
 
 from psycopg.types.json import Jsonb
 
 from biresnerf import __version__
-from biresnerf.errors import FaultError
-from workers.database.claimed_work import LeasedWork
 from workers.database.database import Database
-from workers.database.losses import LOSSES_MAX
 from workers.database.notifications import Listener
 from workers.datasets.uploads import PIECE_MAX_BYTES, UploadStore, require_size
 from workers.jobs.quotas import require_byte_quota
@@ -31,67 +29,50 @@ from workers.settings.errors import Conflict, NotFound, Unavailable
 from workers.settings.settings import Settings
 from workers.store.files import FileStore
 from workers.store.trash import discard
-from workers.webhooks.outbound import TROUBLES, Opened, Outbound
-from workers.webhooks.transfers import HEAD_S, IDLE_S, SLOW_S, SLOWEST_BYTES_PER_S, TransferFailed
-from workers.webhooks.webhook_sender import pause
+from workers.webhooks.outbound import TROUBLES, Answer, Outbound
+from workers.webhooks.transfers import (
+    HEAD_S,
+    IDLE_S,
+    SLOW_S,
+    SLOWEST_BYTES_PER_S,
+    TransferFailed,
+    TransferWork,
+)
 
 log = logging.getLogger(__name__)
 
-ROUNDS_MAX = 5
 _MINE = "state = 'receiving' AND EXISTS (SELECT 1 FROM upload_fetches WHERE id = uploads.id AND token = %s)"
 _RANGE = re.compile(r"bytes (\d{1,18})-\d{1,18}/(\d{1,18})")
 
 
-class Fetcher(LeasedWork):
+class Fetcher(TransferWork):
     """Runs in every dispatcher; several may."""
 
-    at_once, per_tenant = 16, 8
+    at_once, per_tenant, rounds_max = 16, 8, 5
     table = "upload_fetches"
     owners = "JOIN uploads USING (id) JOIN datasets ON datasets.id = uploads.dataset_id WHERE true"
+    raised = (Unavailable, NotFound, Conflict)
 
     def __init__(
         self, database: Database, files: FileStore, listener: Listener, outbound: Outbound, settings: Settings
     ) -> None:
-        super().__init__(database, listener, settings.poll_s, 2 * settings.beat_s)
-        self._files, self._outbound, self._settings = files, outbound, settings
-        self._uploads = UploadStore(database, files, settings)
+        super().__init__(database, listener, outbound, settings)
+        self._files, self._uploads = files, UploadStore(database, files, settings)
         local = [settings.files_dir] if settings.storage_url is None else []
         self._disk = DiskBudget(local, settings.disk_reserve_bytes) if local else None
 
     async def _do(self, row: dict[str, Any]) -> None:
         with contextlib.suppress(NotFound, Conflict):  # deleted, or another process has it
-            upload = await self._uploads.get(row["id"])
-            failed = await self._attempt(row, upload)
+            before = await self._uploads.get(row["id"])
+            failed = await self._attempt(row)
             if failed is not None:
-                await self._set_back(row, upload, failed)
-
-    async def _attempt(self, row: dict[str, Any], upload: Upload) -> TransferFailed | None:
-        if row["losses"] >= LOSSES_MAX:
-            return TransferFailed(
-                f"was given up: {LOSSES_MAX} processes were lost while they fetched from it"
-            )
-        try:
-            await self._receive(row, upload)
-        except (NotFound, Conflict, Unavailable):
-            raise
-        except TransferFailed as failed:
-            return failed
-        except FaultError as error:  # a limit; a full disk may have room later
-            return TransferFailed(error.detail, code=error.code, again=error.code == "storage_full")
-        except TROUBLES as trouble:
-            return TransferFailed.of_trouble(trouble)
-        except Exception:  # a fault of ours must not repeat without end
-            log.exception("upload %s could not be fetched", upload.id)
-            return TransferFailed("could not be read, by a fault of the service", again=True)
-        return None
+                await self._set_back(row, before, failed)
 
     async def _set_back(self, row: dict[str, Any], before: Upload, failed: TransferFailed) -> None:
         """Have it tried again later, or reject the upload. Only tries in a row that bring little are counted."""
         now = await self._uploads.get(before.id)
         round_ = 0 if now.received - before.received >= PIECE_MAX_BYTES else row["round"] + 1
-        if failed.again and round_ < ROUNDS_MAX:
-            wait_s = max(pause(max(round_, 1), self._settings.webhook_retry_s), failed.wait_s)
-            await self._give_back(row, round_=round_, wait_s=wait_s)
+        if await self._comes_again(row, failed, round_):
             return
         error = failed.error(now.host, now.path or "the archive", "fetch_failed")
         log.info("upload %s is rejected: %s", now.id, error)
@@ -106,11 +87,15 @@ class Fetcher(LeasedWork):
                 await connection.execute("DELETE FROM upload_pieces WHERE upload_id = %s", (now.id,))
                 await discard(connection, now.folder)
 
-    async def _receive(self, row: dict[str, Any], upload: Upload) -> None:
+    async def _transfer(self, row: dict[str, Any]) -> None:
+        upload = await self._uploads.get(row["id"])
         headers = {"User-Agent": f"BiResNeRF/{__version__}", "Accept-Encoding": "identity"}
         if upload.received and row["etag"]:
             headers |= {"Range": f"bytes={upload.received}-", "If-Range": row["etag"]}
-        async with self._outbound.get(row["url"], headers, head_s=HEAD_S, idle_s=IDLE_S) as answer:
+        async with self._outbound.get(row["url"], headers, head_s=HEAD_S, idle_s=IDLE_S) as (
+            answer,
+            chunks,
+        ):
             start, total = _extent(answer, upload.received, row["etag"])
             if start is None:
                 await self._begun(upload, 0, None)
@@ -120,7 +105,7 @@ class Fetcher(LeasedWork):
             require_size(self._settings, upload.kind, total or 0)
             etag = answer.headers.get("etag", "")
             upload = await self._begun(upload, start, etag if etag.startswith('"') else None)
-            await self._store(upload, answer, total, row["size"])
+            await self._store(upload, chunks, total, row["size"])
 
     async def _begun(self, upload: Upload, start: int, etag: str | None) -> Upload:
         """The upload with the bytes before ``start`` alone, and the tag of what follows."""
@@ -140,7 +125,9 @@ class Fetcher(LeasedWork):
             )
         return await self._uploads.get(upload.id)
 
-    async def _store(self, upload: Upload, answer: Opened, total: int | None, said: int | None) -> None:
+    async def _store(
+        self, upload: Upload, chunks: AsyncIterator[bytes], total: int | None, said: int | None
+    ) -> None:
         began, before, piece = time.monotonic(), upload.received, bytearray()
 
         async def add() -> None:
@@ -149,7 +136,7 @@ class Fetcher(LeasedWork):
             piece.clear()
 
         try:
-            async for chunk in answer.chunks:
+            async for chunk in chunks:
                 piece += chunk
                 have = upload.received + len(piece)
                 require_size(self._settings, upload.kind, have)
@@ -207,7 +194,7 @@ def _other_size(found: int | None, said: int) -> TransferFailed:
     return TransferFailed(f"Announced were {said} bytes, there are {found}.", code="digest_mismatch")
 
 
-def _extent(answer: Opened, received: int, etag: str | None) -> tuple[int | None, int | None]:
+def _extent(answer: Answer, received: int, etag: str | None) -> tuple[int | None, int | None]:
     """Where the body begins in the file, none if that is of no use, and the file's size if it is said.
 
     Raises `TransferFailed`.
@@ -219,4 +206,4 @@ def _extent(answer: Opened, received: int, etag: str | None) -> tuple[int | None
     if answer.status in {206, 416}:
         same = part is not None and int(part[1]) == received and answer.headers.get("etag", etag) == etag
         return (received, int(part[2])) if part and same and answer.status == 206 else (None, None)
-    raise TransferFailed.of_answer(answer.status, answer.headers)
+    raise TransferFailed.of_answer(answer)

@@ -13,19 +13,16 @@ from urllib.parse import urlsplit
 
 from biresnerf import __version__
 from biresnerf.wire.problems import JobError
-from workers.database.claimed_work import LeasedWork
 from workers.database.database import Database
-from workers.database.losses import LOSSES_MAX
 from workers.database.notifications import Listener
 from workers.jobs.deliveries import DUE, lock_for_delivery, note_delivery
 from workers.jobs.jobs import JobStore
 from workers.records import Artifact
-from workers.settings.errors import Expired, NotFound, Unavailable
 from workers.settings.settings import Settings
 from workers.store.files import FileStore
-from workers.webhooks.outbound import TROUBLES, Outbound
-from workers.webhooks.transfers import SLOW_S, SLOWEST_BYTES_PER_S, TransferFailed
-from workers.webhooks.webhook_sender import ROUNDS_MAX, pause
+from workers.webhooks.outbound import Outbound
+from workers.webhooks.transfers import SLOW_S, SLOWEST_BYTES_PER_S, TransferFailed, TransferWork
+from workers.webhooks.webhook_sender import ROUNDS_MAX
 
 log = logging.getLogger(__name__)
 
@@ -33,10 +30,10 @@ log = logging.getLogger(__name__)
 ZIP_BYTES_MAX = 2**31 - 1
 
 
-class Deliverer(LeasedWork):
+class Deliverer(TransferWork):
     """Runs in every dispatcher; several may."""
 
-    at_once, per_tenant = 8, 4
+    at_once, per_tenant, rounds_max = 8, 4, ROUNDS_MAX
     table = "job_deliveries"
     owners = DUE
 
@@ -49,15 +46,12 @@ class Deliverer(LeasedWork):
         outbound: Outbound,
         settings: Settings,
     ) -> None:
-        super().__init__(database, listener, settings.poll_s, 2 * settings.beat_s)
-        self._jobs, self._files, self._outbound, self._settings = jobs, files, outbound, settings
+        super().__init__(database, listener, outbound, settings)
+        self._jobs, self._files = jobs, files
 
     async def _do(self, row: dict[str, Any]) -> None:
         failed = await self._attempt(row)
-        round_ = row["round"] + 1
-        if failed is not None and failed.again and round_ < ROUNDS_MAX:
-            wait_s = max(pause(round_, self._settings.webhook_retry_s), failed.wait_s)
-            await self._give_back(row, round_=round_, wait_s=wait_s)
+        if failed is not None and await self._comes_again(row, failed, row["round"] + 1):
             return
         host = urlsplit(row["url"]).hostname or ""
         error = (
@@ -65,25 +59,7 @@ class Deliverer(LeasedWork):
         )
         await self._conclude(row, host, error)
 
-    async def _attempt(self, row: dict[str, Any]) -> TransferFailed | None:
-        if row["losses"] >= LOSSES_MAX:
-            return TransferFailed(f"was given up: {LOSSES_MAX} processes were lost while they sent to it")
-        try:
-            await self._send(row)
-        except Unavailable:
-            raise
-        except TransferFailed as failed:
-            return failed
-        except (Expired, NotFound) as error:
-            return TransferFailed(error.detail, code=error.code)
-        except TROUBLES as trouble:
-            return TransferFailed.of_trouble(trouble)
-        except Exception:  # a fault of ours must not repeat without end
-            log.exception("a file of %s could not be sent", row["job_id"])
-            return TransferFailed("was sent nothing, by a fault of the service", again=True)
-        return None
-
-    async def _send(self, row: dict[str, Any]) -> None:
+    async def _transfer(self, row: dict[str, Any]) -> None:
         found = await self._jobs.artifacts(row["job_id"])
         if not found:  # as of a job that ended before it ran
             raise TransferFailed("The job has no files.", code="not_found")
@@ -100,9 +76,9 @@ class Deliverer(LeasedWork):
             size, chunks, kind = artifact.size, self._files.read(artifact.key), artifact.media_type
         headers = {"User-Agent": f"BiResNeRF/{__version__}", "Content-Type": kind}
         limit_s = SLOW_S + size / SLOWEST_BYTES_PER_S
-        answer = await self._outbound.put(row["url"], size, chunks, headers, timeout_s=limit_s)
+        answer = await self._outbound.send("PUT", row["url"], chunks, headers, size=size, timeout_s=limit_s)
         if not 200 <= answer.status < 300:
-            raise TransferFailed.of_answer(answer.status, {"retry-after": answer.retry_after or ""})
+            raise TransferFailed.of_answer(answer)
 
     async def _conclude(self, row: dict[str, Any], host: str, error: JobError | None) -> None:
         if error is not None:

@@ -17,7 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import httpcore
 import httpx
@@ -165,19 +165,10 @@ class _CheckedBackend(httpcore.AsyncNetworkBackend):
 
 @dataclass(frozen=True)
 class Answer:
-    """The response: its status and its `Retry-After`, without a body."""
-
-    status: int
-    retry_after: str | None
-
-
-@dataclass(frozen=True)
-class Opened:
-    """A response whose body is read by who has it; the names of its headers are in lower case."""
+    """A response: its status, and its headers by their names in lower case."""
 
     status: int
     headers: Mapping[str, str]
-    chunks: AsyncIterator[bytes]
 
 
 # What can go wrong with a request that is not a fault of ours.
@@ -218,46 +209,32 @@ class Outbound:
         # Honours SSL_CERT_FILE and SSL_CERT_DIR, for installations with a private certificate authority.
         self._tls = tls or httpx.create_ssl_context()
 
-    async def post(
-        self, address: str, body: bytes, headers: Mapping[str, str], *, timeout_s: float
+    async def send(
+        self,
+        method: Literal["POST", "PUT"],
+        address: str,
+        body: bytes | AsyncIterator[bytes],
+        headers: Mapping[str, str],
+        *,
+        size: int,
+        timeout_s: float,
     ) -> Answer:
-        """POST ``body`` and return the first answer, whatever its status.
+        """Send a body of ``size`` bytes and return the first answer, whatever its status, without its body.
 
         Raises `Refused`, `TimeoutError` (``timeout_s`` for the whole exchange), and httpcore's
         `NetworkError` and `ProtocolError`.
         """
-        length = {"Content-Length": str(len(body))}
-        async with (
-            asyncio.timeout(timeout_s),
-            self._sent("POST", address, {**headers, **length}, body) as response,
-        ):
-            after = _headers(response).get("retry-after")
-            return Answer(response.status, after)
-
-    async def put(
-        self,
-        address: str,
-        size: int,
-        chunks: AsyncIterator[bytes],
-        headers: Mapping[str, str],
-        *,
-        timeout_s: float,
-    ) -> Answer:
-        """PUT ``size`` bytes, as `post` does."""
-        length = {"Content-Length": str(size)}
-        async with (
-            asyncio.timeout(timeout_s),
-            self._sent("PUT", address, {**headers, **length}, chunks) as response,
-        ):
-            return Answer(response.status, _headers(response).get("retry-after"))
+        headers = {**headers, "Content-Length": str(size)}
+        async with asyncio.timeout(timeout_s), self._sent(method, address, headers, body) as response:
+            return _answer(response)
 
     @asynccontextmanager
     async def get(
         self, address: str, headers: Mapping[str, str], *, head_s: float, idle_s: float
-    ) -> AsyncIterator[Opened]:
-        """The answer to a GET, whatever its status, after at most `REDIRECTS_MAX` redirects.
+    ) -> AsyncIterator[tuple[Answer, AsyncIterator[bytes]]]:
+        """The answer to a GET, whatever its status, after at most `REDIRECTS_MAX` redirects, and its body.
 
-        Raises as `post` does: `TimeoutError` after ``head_s`` until the last answer begins, or after ``idle_s``
+        Raises as `send` does: `TimeoutError` after ``head_s`` until the last answer begins, or after ``idle_s``
         between two chunks of its body.
         """
         async with AsyncExitStack() as opened:
@@ -265,14 +242,14 @@ class Outbound:
                 for _ in range(REDIRECTS_MAX + 1):
                     await opened.aclose()
                     response = await opened.enter_async_context(self._sent("GET", address, headers))
-                    found = _headers(response)
-                    if response.status not in REDIRECTS or "location" not in found:
+                    answer = _answer(response)
+                    if answer.status not in REDIRECTS or "location" not in answer.headers:
                         break
-                    address = _joined(address, found["location"])
+                    address = _joined(address, answer.headers["location"])
                 else:
                     raise Refused("too_many_redirects")
             chunks = aiter(response.aiter_stream())  # as they were sent: nothing is unpacked here
-            yield Opened(response.status, found, _steady(chunks, idle_s))
+            yield answer, _steady(chunks, idle_s)
 
     @asynccontextmanager
     async def _sent(
@@ -303,8 +280,9 @@ class Outbound:
             yield response
 
 
-def _headers(response: httpcore.Response) -> dict[str, str]:
-    return {key.decode("latin-1").lower(): value.decode("latin-1") for key, value in response.headers}
+def _answer(response: httpcore.Response) -> Answer:
+    headers = {key.decode("latin-1").lower(): value.decode("latin-1") for key, value in response.headers}
+    return Answer(response.status, headers)
 
 
 def _joined(address: str, location: str) -> str:

@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import logging
+from abc import abstractmethod
+from typing import Any, ClassVar
 
+from biresnerf.errors import FaultError
 from biresnerf.wire.problems import JobError
-from workers.webhooks.outbound import trouble_of
-from workers.webhooks.webhook_sender import outcome_of, retry_after
+from workers.database.claimed_work import LeasedWork
+from workers.database.database import Database
+from workers.database.losses import LOSSES_MAX
+from workers.database.notifications import Listener
+from workers.settings.errors import Unavailable
+from workers.settings.settings import Settings
+from workers.webhooks.outbound import TROUBLES, Answer, Outbound, trouble_of
+from workers.webhooks.webhook_sender import outcome_of, pause, retry_after
+
+log = logging.getLogger(__name__)
 
 # Until an answer's body begins, redirects included, and between two chunks of a body.
 HEAD_S, IDLE_S = 60.0, 60.0
@@ -42,12 +53,12 @@ class TransferFailed(Exception):
         return cls(_WHY[code], code="address_refused" if code in _REFUSED else "", again=again)
 
     @classmethod
-    def of_answer(cls, status: int, headers: Mapping[str, str]) -> TransferFailed:
+    def of_answer(cls, answer: Answer) -> TransferFailed:
         """Of an answer that is none of those hoped for."""
-        expired = "; a signed address may have expired" if status in {400, 401, 403} else ""
-        again = outcome_of(status) == "again"
-        wait_s = retry_after(headers.get("retry-after"))
-        return cls(f"answers {status}{expired}", again=again, wait_s=wait_s)
+        expired = "; a signed address may have expired" if answer.status in {400, 401, 403} else ""
+        again = outcome_of(answer.status) == "again"
+        wait_s = retry_after(answer)
+        return cls(f"answers {answer.status}{expired}", again=again, wait_s=wait_s)
 
     def error(self, host: str | None, where: str, code: str) -> JobError:
         """What the user sees; ``code`` where the failure has none of its own."""
@@ -59,3 +70,48 @@ class TransferFailed(Exception):
             hint="Check the address, or sign a new one." if of_host else "",
             retryable=self.again,
         )
+
+
+class TransferWork(LeasedWork):
+    """Files on their way from or to addresses of users, each row a file; tried again for as long as that may help."""
+
+    rounds_max: ClassVar[int]
+    # What the work is free to raise: no failures of the transfer.
+    raised: ClassVar[tuple[type[FaultError], ...]] = (Unavailable,)
+
+    def __init__(
+        self, database: Database, listener: Listener, outbound: Outbound, settings: Settings
+    ) -> None:
+        super().__init__(database, listener, settings.poll_s, 2 * settings.beat_s)
+        self._outbound, self._settings = outbound, settings
+
+    @abstractmethod
+    async def _transfer(self, row: dict[str, Any]) -> None:
+        """One try."""
+
+    async def _attempt(self, row: dict[str, Any]) -> TransferFailed | None:
+        """Why a try came to nothing; None where it did not."""
+        if row["losses"] >= LOSSES_MAX:
+            return TransferFailed(f"was given up: {LOSSES_MAX} processes were lost during the transfer")
+        try:
+            await self._transfer(row)
+        except self.raised:
+            raise
+        except TransferFailed as failed:
+            return failed
+        except FaultError as error:  # a limit; a full disk may have room later
+            return TransferFailed(error.detail, code=error.code, again=error.code == "storage_full")
+        except TROUBLES as trouble:
+            return TransferFailed.of_trouble(trouble)
+        except Exception:  # a fault of ours must not repeat without end
+            log.exception("the transfer of %s failed", row["id"])
+            return TransferFailed("could not be used, by a fault of the service", again=True)
+        return None
+
+    async def _comes_again(self, row: dict[str, Any], failed: TransferFailed, round_: int) -> bool:
+        """Whether there will be a try after this one, which ended the round of that number; then it is given back."""
+        if not failed.again or round_ >= self.rounds_max:
+            return False
+        wait_s = max(pause(max(round_, 1), self._settings.webhook_retry_s), failed.wait_s)
+        await self._give_back(row, round_=round_, wait_s=wait_s)
+        return True

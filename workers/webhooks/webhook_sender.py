@@ -15,19 +15,19 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from email.utils import parsedate_to_datetime
 from typing import Any, Literal
 
 import psycopg
 
 from biresnerf import __version__
+from biresnerf.wire.retry_after import retry_after_s
 from biresnerf.wire.webhooks import key_of
 from workers.database.claimed_work import ClaimedWork
 from workers.database.database import Connection, Database
 from workers.database.notifications import Listener
 from workers.settings.errors import Unavailable
 from workers.settings.settings import Settings
-from workers.webhooks.outbound import TROUBLES, Outbound, trouble_of
+from workers.webhooks.outbound import TROUBLES, Answer, Outbound, trouble_of
 from workers.webhooks.webhooks import drop_pending
 
 log = logging.getLogger(__name__)
@@ -109,7 +109,7 @@ class WebhookSender(ClaimedWork):
     async def _post(self, url: str, body: bytes, headers: dict[str, str]) -> Result:
         limit = self._settings.webhook_timeout_s
         try:
-            answer = await self._outbound.post(url, body, headers, timeout_s=limit)
+            answer = await self._outbound.send("POST", url, body, headers, size=len(body), timeout_s=limit)
         except TROUBLES as error:
             code, again = trouble_of(error)
             return Result("again" if again else "failed", error=code)
@@ -117,7 +117,7 @@ class WebhookSender(ClaimedWork):
             # Our own failure on this one message must not repeat every minute without end.
             log.exception("webhook message %s could not be sent", headers["webhook-id"])
             return Result("again", error="internal")
-        return Result(outcome_of(answer.status), answer.status, None, retry_after(answer.retry_after))
+        return Result(outcome_of(answer.status), answer.status, None, retry_after(answer))
 
     async def _conclude(
         self, connection: Connection, row: dict[str, Any], result: Result, at: datetime, seconds: float
@@ -194,17 +194,9 @@ def pause(round_: int, first_s: float) -> float:
     return min(first_s * PAUSE_FACTOR ** (round_ - 1), PAUSE_MAX_S) * random.uniform(1 - JITTER, 1 + JITTER)
 
 
-def retry_after(header: str | None) -> float:
+def retry_after(answer: Answer) -> float:
     """Seconds the receiver asks for, at most 12 h; 0 where it asks for none that can be read."""
-    text = (header or "").strip()
-    if text.isdecimal() and len(text) < 10:
-        return min(float(text), PAUSE_MAX_S)
-    try:
-        at = parsedate_to_datetime(text)
-    except (TypeError, ValueError):
-        return 0.0
-    wait_s = ((at if at.tzinfo else at.replace(tzinfo=UTC)) - datetime.now(UTC)).total_seconds()
-    return min(max(wait_s, 0.0), PAUSE_MAX_S)
+    return min(retry_after_s(answer.headers.get("retry-after")) or 0.0, PAUSE_MAX_S)
 
 
 def signed_headers(delivery_id: str, at: int, body: bytes, valid: Sequence[str]) -> dict[str, str]:

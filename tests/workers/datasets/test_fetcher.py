@@ -131,7 +131,7 @@ async def test_a_server_that_is_busy_is_asked_again_and_one_that_refuses_is_not(
 async def test_a_server_that_stays_broken_is_given_up(
     stores: Stores, dispatchers: Dispatchers, files: FileServer, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(fetcher, "ROUNDS_MAX", 3)
+    monkeypatch.setattr(fetcher.Fetcher, "rounds_max", 3)
     monkeypatch.setattr(fetcher, "IDLE_S", 0.2)
     monkeypatch.setattr(fetcher, "HEAD_S", 0.2)
     broken = [
@@ -149,7 +149,7 @@ async def test_a_server_that_stays_broken_is_given_up(
 async def test_a_drip_is_not_waited_for(
     stores: Stores, dispatchers: Dispatchers, files: FileServer, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(fetcher, "ROUNDS_MAX", 1)
+    monkeypatch.setattr(fetcher.Fetcher, "rounds_max", 1)
     monkeypatch.setattr(fetcher, "SLOW_S", 0.3)
     monkeypatch.setattr(fetcher, "SLOWEST_BYTES_PER_S", 2e6)
     slow = await fetch(stores, files.file("/slow", CONTENT, pause_s=0.1))

@@ -23,7 +23,7 @@ from workers.engine import Stores
 from workers.settings.errors import Conflict
 from workers.settings.settings import Settings
 from workers.webhooks import webhooks
-from workers.webhooks.outbound import Outbound, Policy
+from workers.webhooks.outbound import Answer, Outbound, Policy
 from workers.webhooks.webhook_sender import _CLAIM, WebhookSender, outcome_of, pause, retry_after
 
 pytestmark = pytest.mark.anyio
@@ -224,9 +224,10 @@ def test_only_some_statuses_are_worth_another_try():
     [(None, 0), ("", 0), ("7", 7), ("-1", 0), ("soon", 0), ("99999999", 43200), ("9" * 400, 0), ("1.5", 0)],
 )
 def test_retry_after_is_read_with_care(header: str | None, seconds: float):
-    assert retry_after(header) == seconds
+    assert retry_after(Answer(503, {} if header is None else {"retry-after": header})) == seconds
 
 
 def test_retry_after_may_be_a_date():
-    assert retry_after("Wed, 21 Oct 2015 07:28:00 GMT") == 0
-    assert retry_after("Wed, 21 Oct 2099 07:28:00 GMT") == 43200
+    for year, seconds in ((2015, 0), (2099, 43200)):
+        header = {"retry-after": f"Wed, 21 Oct {year} 07:28:00 GMT"}
+        assert retry_after(Answer(503, header)) == seconds
