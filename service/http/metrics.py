@@ -31,7 +31,7 @@ from prometheus_client.registry import Collector
 from biresnerf import __version__
 from biresnerf.wire.jobs import EventType
 from service.processes import COUNTERS_VARIABLE
-from workers.database.statistics import Statistics, Tally
+from workers.database.statistics import Statistics
 
 _ANSWER_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0)
 # Tally in the database -> metric, name of its label, help text.
@@ -148,20 +148,20 @@ def _families(now: Statistics) -> Iterator[Metric]:
     for name, help_text, column in _QUEUE:
         depth = GaugeMetricFamily(name, help_text, labels=["kind"])
         for row in now.queue:
-            depth.add_metric([row.slot_kind], getattr(row, column))
+            depth.add_metric([row["slot_kind"]], row[column])
         yield depth
     slots = GaugeMetricFamily("biresnerf_slots", "Living worker slots.", labels=["kind", "busy"])
     for slot in now.slots:
-        slots.add_metric([slot.kind, str(slot.busy).lower()], slot.slots)
+        slots.add_metric([slot["kind"], str(slot["busy"]).lower()], slot["slots"])
     yield slots
     for tally, (name, label, help_text) in _COUNTERS.items():
         counter = CounterMetricFamily(name, help_text, labels=[label] if label else [])
-        found = {item.label: item.amount for item in now.tallies if item.name == tally}
+        found = {item["label"]: item["amount"] for item in now.tallies if item["name"] == tally}
         for value in sorted({*found, *_FROM_ZERO.get(tally, () if label else ("",))}):
             counter.add_metric([value] if label else [], found.get(value, 0.0))
         yield counter
     for tally, (name, label, help_text) in _DURATIONS.items():
-        durations = [item for item in now.tallies if item.name == tally]
+        durations = [item for item in now.tallies if item["name"] == tally]
         yield _histogram(name, help_text, label, durations, now.bounds_s)
 
 
@@ -173,18 +173,18 @@ def _by_state(name: str, help_text: str, values: Mapping[Any, float]) -> Metric:
 
 
 def _histogram(
-    name: str, help_text: str, label: str, tallies: list[Tally], bounds_s: tuple[float, ...]
+    name: str, help_text: str, label: str, tallies: list[dict[str, Any]], bounds_s: list[float]
 ) -> Metric:
     family = HistogramMetricFamily(name, help_text, labels=[label] if label else [])
-    for value in sorted({item.label for item in tallies}):
-        mine = [item for item in tallies if item.label == value]
-        counts = {item.bucket: item.count for item in mine}
+    for value in sorted({item["label"] for item in tallies}):
+        mine = [item for item in tallies if item["label"] == value]
+        counts = {item["bucket"]: item["count"] for item in mine}
         buckets, below = [], 0
         # A duration in bucket i is less than bound i; those beyond the last bound are in one bucket more.
         for index, bound in enumerate((*bounds_s, float("inf"))):
             below += counts.get(index, 0)
             buckets.append(("+Inf" if bound == float("inf") else f"{bound:g}", float(below)))
-        family.add_metric([value] if label else [], buckets, sum_value=sum(item.amount for item in mine))
+        family.add_metric([value] if label else [], buckets, sum_value=sum(item["amount"] for item in mine))
     return family
 
 

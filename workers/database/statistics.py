@@ -2,52 +2,37 @@
 
 from __future__ import annotations
 
-from biresnerf.frozen_model import FrozenModel
+from dataclasses import dataclass
+
+from psycopg.rows import DictRow
+
 from biresnerf.wire.datasets import DatasetState
 from biresnerf.wire.jobs import JobState
 from workers.database.database import Connection, Database
 
 
-class Tally(FrozenModel):
-    """How often something happened, and what it adds up to. Durations have a bucket, all else is in bucket 0."""
+@dataclass(frozen=True)
+class Statistics:
+    """The installation at one moment.
 
-    name: str
-    label: str
-    bucket: int
-    count: int
-    amount: float
-
-
-class SlotCount(FrozenModel):
-    """Living slots of one kind that do, or do not, run a refinement; exports run beside them."""
-
-    kind: str
-    busy: bool
-    slots: int
-
-
-class QueueDepth(FrozenModel):
-    """A row of the view ``queue_depth``: what waits for a slot of one kind, and what runs on one."""
-
-    slot_kind: str
-    waiting: int
-    held: int
-    running: int
-    oldest_s: float
-
-
-class Statistics(FrozenModel):
-    """The installation at one moment. ``tallies`` only ever grow."""
+    Attributes:
+        queue: rows of the view ``queue_depth``: what waits for a slot of one kind, and what runs on one.
+        slots: rows (kind, busy, slots): how many living slots of a kind do, or do not, run a refinement; exports run
+            beside them.
+        bounds_s: of the buckets of durations.
+        tallies: rows (name, label, bucket, count, amount): how often something happened, and what it adds up to. They
+            only ever grow. Durations have a bucket, all else is in bucket 0.
+    """
 
     jobs: dict[JobState, int]
     datasets: dict[DatasetState, int]
-    queue: tuple[QueueDepth, ...]
-    slots: tuple[SlotCount, ...]
+    queue: list[DictRow]
+    slots: list[DictRow]
     trash: int
     webhooks_pending: int
     webhooks_late_s: float
-    bounds_s: tuple[float, ...]
-    tallies: tuple[Tally, ...]
+    bounds_s: list[float]
+    tallies: list[DictRow]
 
 
 _LIVING = """slots JOIN queue_workers AS worker ON worker.id = slots.worker_id
@@ -81,13 +66,13 @@ async def read_statistics(database: Database, stall_s: float) -> Statistics:
         return Statistics(
             jobs={row["state"]: row["jobs"] for row in jobs},
             datasets={row["state"]: row["n"] for row in datasets},
-            queue=tuple(QueueDepth(**row) for row in await connection.rows("SELECT * FROM queue_depth")),
-            slots=tuple(SlotCount(**row) for row in await connection.rows(_SLOTS, stall_s)),
+            queue=await connection.rows("SELECT * FROM queue_depth"),
+            slots=await connection.rows(_SLOTS, stall_s),
             trash=trash["n"],
             webhooks_pending=webhooks["pending"],
             webhooks_late_s=webhooks["late_s"],
-            bounds_s=tuple(bounds["bounds_s"]),
-            tallies=tuple(Tally(**row) for row in await connection.rows(_TALLIES)),
+            bounds_s=bounds["bounds_s"],
+            tallies=await connection.rows(_TALLIES),
         )
 
 

@@ -137,9 +137,9 @@ async def test_what_got_through_though_its_answer_was_lost_is_written_once(
     assert await ledger.publish([FILE], "improved", ["seeding_crashed"])
     monkeypatch.undo()
     counted = [
-        (tally.label, tally.count)
+        (tally["label"], tally["count"])
         for tally in (await stores.monitor.statistics()).tallies
-        if tally.name == "job_faults"
+        if tally["name"] == "job_faults"
     ]
     assert counted == [("seeding_crashed", 1)]
     assert [line.text for line in await stores.jobs.log(ledger.claim.job_id)] == ["one"]

@@ -322,7 +322,7 @@ async def test_a_tenant_at_its_seconds_of_the_day_submits_no_more_until_midnight
 async def test_metrics_name_the_first_hundred_tenants_alone(stores: Stores, database: Database):
     async def seconds() -> dict[str, float]:
         tallies = (await stores.monitor.statistics()).tallies
-        return {tally.label: tally.amount for tally in tallies if tally.name == "wall_seconds"}
+        return {tally["label"]: tally["amount"] for tally in tallies if tally["name"] == "wall_seconds"}
 
     await _failed(database, await _begun(stores))
     assert await seconds() == {"local": pytest.approx(100, abs=5)}

@@ -206,7 +206,7 @@ async def test_a_job_that_expired_in_the_queue_is_told_counted_and_makes_room(
     assert (await stores.jobs.counts())["expired"] == 1
     now = await stores.monitor.statistics()
     assert now.jobs["expired"] == 1
-    counted = {(tally.name, tally.label): tally.count for tally in now.tallies}
+    counted = {(tally["name"], tally["label"]): tally["count"] for tally in now.tallies}
     assert (counted["job_events", "expired"], counted["job_seconds", "expired"]) == (1, 1)
     await stores.jobs.delete(job.id)
 
