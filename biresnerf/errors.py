@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, Self
 
 from pydantic import Field
@@ -60,3 +62,16 @@ class RefinementError(FaultError):
 
 class Interrupted(BiresnerfError):
     """Stopped on request; a checkpoint and a usable partial result are in the output folder."""
+
+
+@contextmanager
+def needs_extra(extra: str) -> Iterator[None]:
+    """Around imports of what an extra of this package installs; raises `InputError` (``extra_missing``)."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise InputError(
+            "extra_missing",
+            f"The package {error.name} is not installed.",
+            hint=f"Install it with: pip install 'biresnerf[{extra}]'",
+        ) from None

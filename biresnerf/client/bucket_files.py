@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from biresnerf.errors import InputError
+from biresnerf.errors import InputError, needs_extra
 from biresnerf.wire.datasets import FileAddress
 from biresnerf.wire.deliveries import DeliverTo
 from biresnerf.wire.safe_paths import checked_path, is_litter
@@ -78,14 +78,8 @@ def _client(bucket: str) -> Any:
 @contextmanager
 def _told(address: str) -> Iterator[None]:
     """Faults of credentials, network and bucket in our words."""
-    try:
+    with needs_extra("s3"):
         from botocore.exceptions import BotoCoreError, ClientError
-    except ModuleNotFoundError as error:
-        raise InputError(
-            "extra_missing",
-            f"The package {error.name} is not installed.",
-            hint="Install it with: pip install 'biresnerf[s3]'",
-        ) from None
     try:
         yield
     except (BotoCoreError, ClientError) as error:

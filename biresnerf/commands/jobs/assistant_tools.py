@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from biresnerf.commands.jobs.service_options import DEFAULT_URL, PAGE, client_extra, service_options
-from biresnerf.errors import BiresnerfError
+from biresnerf.commands.jobs.service_options import DEFAULT_URL, PAGE, service_options
+from biresnerf.errors import BiresnerfError, needs_extra
 
 if TYPE_CHECKING:
     from mcp.server import MCPServer
@@ -32,7 +32,7 @@ def mcp_command(url: str | None, api_key: str | None) -> None:
 
     An assistant's program starts this command, and uses the service with your API key and your files.
     """
-    with client_extra("mcp"):
+    with needs_extra("mcp"):
         server = tool_server(url or DEFAULT_URL, api_key)
     server.run("stdio")
 

@@ -12,7 +12,7 @@ import click
 from biresnerf.commands import exit_codes
 from biresnerf.commands.answers import with_code
 from biresnerf.commands.exit_codes import CommandFailed
-from biresnerf.errors import InputError
+from biresnerf.errors import needs_extra
 
 if TYPE_CHECKING:
     from biresnerf.client import Client, ServiceError
@@ -64,22 +64,9 @@ def service_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 @contextmanager
-def client_extra(extra: str = "client") -> Iterator[None]:
-    """Around imports of what an extra of this package installs; raises `InputError` (``extra_missing``)."""
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        raise InputError(
-            "extra_missing",
-            f"The package {error.name} is not installed.",
-            hint=f"Install it with: pip install 'biresnerf[{extra}]'",
-        ) from None
-
-
-@contextmanager
 def service_at(url: str | None, api_key: str | None, job: JobName | None = None) -> Iterator[Client]:
     """A client of the service in the job's address, at `--url`, or on this machine. Errors become exit codes."""
-    with client_extra():
+    with needs_extra("client"):
         from biresnerf.client import Client, JobFailed, ServiceError
     try:
         chosen = (job.url if job is not None else None) or url or DEFAULT_URL

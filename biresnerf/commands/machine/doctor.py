@@ -11,8 +11,8 @@ from rich.console import Console
 
 from biresnerf.commands import exit_codes
 from biresnerf.commands.answers import json_option, print_json
-from biresnerf.commands.jobs.service_options import client_extra
 from biresnerf.commands.machine.machine_checks import CHECKS, Check, Found
+from biresnerf.errors import needs_extra
 
 SERVICE_CHECKS = "service.commands.doctor_checks:CHECKS"
 
@@ -32,7 +32,7 @@ def doctor_command(service: str | None, api_key: str | None, as_json: bool) -> i
     """
     findings = _findings()
     if service is not None:
-        with client_extra():
+        with needs_extra("client"):
             from biresnerf.commands.machine.service_checks import service_checks
         findings = service_checks(service, api_key)
     found = []

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from biresnerf.data.model.atomic_file import whole_file
-from biresnerf.errors import InputError
+from biresnerf.errors import InputError, needs_extra
 from biresnerf.geometry.pose_error import CameraErrors
 
 SUFFIXES = (".png", ".svg", ".pdf")
@@ -35,16 +35,9 @@ def plot_errors(path: Path, sets: dict[str, CameraErrors], distance: float, titl
     Raises:
         InputError: ``extra_missing`` without matplotlib.
     """
-    try:
+    with needs_extra("plots"):
         from matplotlib import rc_context
         from matplotlib.figure import Figure
-    except ModuleNotFoundError:
-        raise InputError(
-            "extra_missing",
-            "needs matplotlib, which is not installed.",
-            where="biresnerf evaluate --plot",
-            hint="Install it with: pip install 'biresnerf[plots]'",
-        ) from None
     figure = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")
     rotation, centre = figure.subplots(2, 1, sharex=True)
     for label, errors in sets.items():

@@ -5,7 +5,6 @@ Also the options and functions that `biresnerf study` shares.
 
 from __future__ import annotations
 
-import importlib.util
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -19,7 +18,7 @@ import click
 from biresnerf.commands.answers import json_option, print_json
 from biresnerf.commands.machine.this_machine import describe_machine
 from biresnerf.commands.settings_option import parse_settings, settings_option
-from biresnerf.errors import InputError
+from biresnerf.errors import InputError, needs_extra
 from biresnerf.options.presets import PRESET_IF_LEFT_OUT, PRESETS
 
 if TYPE_CHECKING:
@@ -182,18 +181,6 @@ def _end(number: int, _frame: FrameType | None) -> None:
     sys.exit(128 + number)
 
 
-def require(*packages: str) -> None:
-    """Raise `InputError` if a package that tables or plots need is missing, before anything runs."""
-    missing = [name for name in packages if importlib.util.find_spec(name) is None]
-    if missing:
-        raise InputError(
-            "extra_missing",
-            f"needs {' and '.join(missing)}, which is not installed.",
-            where="biresnerf compare",
-            hint="Install it with: pip install 'biresnerf[studies]'",
-        )
-
-
 @click.command("compare")
 @comparison_options
 def compare_command(**given: Any) -> int:
@@ -204,7 +191,8 @@ def compare_command(**given: Any) -> int:
     OUT/tables.md and OUT/tables.json hold errors, image quality, times, memory, and Wilcoxon's test between the
     first variant and each other one. A failed run is a line in the tables; the exit status is then 1.
     """
-    require("scipy")
+    with needs_extra("studies"):
+        import scipy  # noqa: F401 - before anything runs
     plan = make_plan(given, chosen_variants(given), shared_settings(given), given["noise"] or (0.15,))
     entries = run_and_write(plan, given)
     return int(any(entry.result.error is not None for entry in entries))

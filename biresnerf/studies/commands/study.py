@@ -6,13 +6,12 @@ from typing import Any
 
 import click
 
-from biresnerf.errors import InputError
+from biresnerf.errors import InputError, needs_extra
 from biresnerf.studies.commands.compare import (
     CELLS,
     chosen_variants,
     comparison_options,
     make_plan,
-    require,
     run_and_write,
     shared_settings,
 )
@@ -30,7 +29,9 @@ def study_command(name: str, **given: Any) -> int:
     pose error around the switch with and without it; noise varies the error of the given poses for the named
     methods or variants. The plot is OUT/NAME.svg and OUT/NAME.png.
     """
-    require("scipy", "matplotlib")
+    with needs_extra("studies"):  # before anything runs
+        import matplotlib  # noqa: F401
+        import scipy  # noqa: F401
     from biresnerf.studies.plots import plot_curves, plot_noise, plot_sweep
     from biresnerf.studies.studies import STUDIES
 
