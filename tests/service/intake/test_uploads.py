@@ -4,7 +4,7 @@ import asyncio
 import fcntl
 import itertools
 import os
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator, AsyncIterator
 from pathlib import Path
 
 import pytest
@@ -14,10 +14,11 @@ from starlette.requests import Request
 from starlette.types import Message
 
 from service.http.problems import ProblemError
-from service.intake.uploads import Form, capped, limited_body, staging_folder, sweep_staging
+from service.intake.one_shot import read_form
+from service.intake.uploads import capped, limited_body, staging_folder, sweep_staging
 
 
-async def pieces(content: bytes, cuts: list[int]) -> AsyncIterator[bytes]:
+async def pieces(content: bytes, cuts: list[int]) -> AsyncGenerator[bytes, None]:
     edges = [0, *sorted(cut % (len(content) + 1) for cut in cuts), len(content)]
     for start, end in itertools.pairwise(edges):
         yield content[start:end]
@@ -83,11 +84,10 @@ def test_a_form_is_read_the_same_however_it_is_cut(
     head = '--b0und\r\nContent-Disposition: form-data; name="{}"{}\r\n\r\n'
     body = head.format("options", "").encode() + text.encode() + b"\r\n"
     body += head.format("archive", '; filename="a.zip"').encode() + archive + b"\r\n--b0und--\r\n"
-    form = Form("archive", {"options"}, target)
     if b"--b0und" in archive + text.encode():
         return
-    asyncio.run(form.read("multipart/form-data; boundary=b0und", pieces(body, cuts)))
-    assert (form.texts, target.read_bytes()) == ({"options": text}, archive)
+    texts = asyncio.run(read_form("multipart/form-data; boundary=b0und", pieces(body, cuts), target))
+    assert (texts, target.read_bytes()) == ({"options": text}, archive)
 
 
 @pytest.mark.parametrize(
@@ -95,6 +95,7 @@ def test_a_form_is_read_the_same_however_it_is_cut(
     [
         (b"", "malformed_body"),
         (b"no form", "malformed_body"),
+        (b'--b\r\nContent-Disposition: form-data; name="archive"; filename="a"\r\n\r\n12', "malformed_body"),
         (
             b'--b\r\nContent-Disposition: form-data; name="options"\r\n\r\n\xff\r\n--b--\r\n',
             "invalid_request",
@@ -103,15 +104,17 @@ def test_a_form_is_read_the_same_however_it_is_cut(
         (b"--b\r\nX: " + b"y" * 20_000 + b"\r\n\r\n1\r\n--b--\r\n", "malformed_body"),
         (
             b'--b\r\nContent-Disposition: form-data; name="options"\r\n\r\n' + b"1" * 300_000,
+            "malformed_body",
+        ),
+        (
+            2 * b'--b\r\nContent-Disposition: form-data; name="options"\r\n\r\n1\r\n' + b"--b--\r\n",
             "invalid_request",
         ),
-        (2 * b'--b\r\nContent-Disposition: form-data; name="options"\r\n\r\n1\r\n', "invalid_request"),
     ],
 )
 def test_a_bad_form_is_a_problem(tmp_path: Path, body: bytes, code: str) -> None:
-    form = Form("archive", {"options"}, tmp_path / "archive")
     with pytest.raises(ProblemError) as caught:
-        asyncio.run(form.read("multipart/form-data; boundary=b", pieces(body, [])))
+        asyncio.run(read_form("multipart/form-data; boundary=b", pieces(body, []), tmp_path / "archive"))
     assert caught.value.code == code
 
 
