@@ -5,34 +5,18 @@ Signed links to single files are not kept: the database has their job's round, w
 
 from __future__ import annotations
 
-import hashlib
-import hmac
-import re
-import secrets
 from typing import Any
 
-from pydantic import Field
-
-from biresnerf.wire.base import Record
 from biresnerf.wire.results import LinkView
 from workers.database.database import OwnedStore
-from workers.database.ids import CROCKFORD, new_id
+from workers.database.ids import new_id
+from workers.jobs.job_rows import MINE
 from workers.records import record_from_row
 from workers.settings.errors import Conflict, LimitReached
+from workers.tenants.tokens import living_row, new_token
 
 MOST = 50  # living links to one job
-# `brl_`, ten characters that may be shown, and 256 random bits, as those of an API key.
-_FORM = re.compile(r"(brl_[0-9A-Z]{10})_[A-Za-z0-9_-]{43}", re.ASCII)
-_NOBODY = bytes(32)
-_MINE = "jobs.tenant = coalesce(%s, jobs.tenant)"
 _LIVING = "result_links.expires_at > clock_timestamp()"
-
-
-class OpenLink(Record):
-    """A living link, and whose job it shows."""
-
-    link: LinkView
-    tenant: str = Field(description="Owner of the job.")
 
 
 class ResultLinkStore(OwnedStore):
@@ -46,13 +30,12 @@ class ResultLinkStore(OwnedStore):
 
         Raises `NotFound`, `LimitReached`, `Conflict` (``result_not_ready``: a failed job is not for strangers).
         """
-        prefix = "brl_" + "".join(secrets.choice(CROCKFORD) for _ in range(10))
-        text = f"{prefix}_{secrets.token_urlsafe(32)}"
+        prefix, text, sha256 = new_token("brl")
         async with self._database.transaction() as connection:
             # Locked, so that two requests do not pass the limit together.
             sql = (
                 "SELECT state = 'succeeded' OR (state = 'cancelled' AND partial) AS shown"
-                f" FROM jobs WHERE id = %s AND {_MINE} FOR UPDATE"
+                f" FROM jobs WHERE id = %s AND {MINE} FOR UPDATE"
             )
             job = await connection.required_row(f"No job {job_id}.", sql, job_id, self._tenant)
             if not job["shown"]:
@@ -66,14 +49,14 @@ class ResultLinkStore(OwnedStore):
             row = await connection.only_row(
                 "INSERT INTO result_links (id, job_id, prefix, sha256, expires_at)"
                 " VALUES (%s, %s, %s, %s, clock_timestamp() + make_interval(secs => %s)) RETURNING *",
-                *(new_id("lnk"), job_id, prefix, _digest(text), valid_s),
+                *(new_id("lnk"), job_id, prefix, sha256, valid_s),
             )
             return _view(row), text
 
     async def list(self, job_id: str) -> tuple[LinkView, ...]:
         """The living links to a job, oldest first; raises `NotFound`."""
         async with self._database.transaction() as connection:
-            sql = f"SELECT id FROM jobs WHERE id = %s AND {_MINE}"
+            sql = f"SELECT id FROM jobs WHERE id = %s AND {MINE}"
             await connection.required_row(f"No job {job_id}.", sql, job_id, self._tenant)
             rows = await connection.rows(
                 f"SELECT * FROM result_links WHERE job_id = %s AND {_LIVING} ORDER BY created_at, id", job_id
@@ -84,44 +67,32 @@ class ResultLinkStore(OwnedStore):
         """End a link for good, from the next request on; raises `NotFound`."""
         sql = (
             "DELETE FROM result_links USING jobs WHERE jobs.id = job_id"
-            f" AND result_links.id = %s AND job_id = %s AND {_MINE} RETURNING result_links.id"
+            f" AND result_links.id = %s AND job_id = %s AND {MINE} RETURNING result_links.id"
         )
         async with self._database.transaction() as connection:
             await connection.required_row(f"No link {link_id}.", sql, link_id, job_id, self._tenant)
 
     async def share_round(self, job_id: str) -> int:
         """The round that links to files of the job are signed with now; raises `NotFound`."""
-        sql = f"SELECT share_round FROM jobs WHERE id = %s AND {_MINE}"
+        sql = f"SELECT share_round FROM jobs WHERE id = %s AND {MINE}"
         async with self._database.transaction() as connection:
             row = await connection.required_row(f"No job {job_id}.", sql, job_id, self._tenant)
         return int(row["share_round"])
 
     async def revoke_shares(self, job_id: str) -> None:
         """End all links to files of the job, by the next round; raises `NotFound`."""
-        sql = f"UPDATE jobs SET share_round = share_round + 1 WHERE id = %s AND {_MINE} RETURNING id"
+        sql = f"UPDATE jobs SET share_round = share_round + 1 WHERE id = %s AND {MINE} RETURNING id"
         async with self._database.transaction() as connection:
             await connection.required_row(f"No job {job_id}.", sql, job_id, self._tenant)
 
-    async def recognise(self, text: str) -> OpenLink | None:
-        """The living link with this text; None says no more than that there is none."""
-        form = _FORM.fullmatch(text)
-        rows = (
-            await self._database.fetch(
-                f"SELECT result_links.*, jobs.tenant, {_LIVING} AS living FROM result_links"
-                " JOIN jobs ON jobs.id = job_id WHERE prefix = %s",
-                form[1],
-            )
-            if form
-            else []
+    async def recognise(self, text: str) -> tuple[LinkView, str] | None:
+        """The living link with this text, and the owner of its job; None says no more than that there is none."""
+        select = (
+            f"SELECT result_links.*, jobs.tenant, {_LIVING} AS living FROM result_links"
+            " JOIN jobs ON jobs.id = job_id WHERE prefix = %s"
         )
-        same = hmac.compare_digest(_digest(text), bytes(rows[0]["sha256"]) if rows else _NOBODY)
-        if not same or not rows or not rows[0]["living"]:
-            return None
-        return OpenLink(link=_view(rows[0]), tenant=rows[0]["tenant"])
-
-
-def _digest(text: str) -> bytes:
-    return hashlib.sha256(text.encode()).digest()
+        row = await living_row(self._database, "brl", text, select)
+        return None if row is None else (_view(row), row["tenant"])
 
 
 def _view(row: dict[str, Any]) -> LinkView:

@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import hashlib
-import hmac
-import re
-import secrets
 import time
 from collections.abc import Iterable
 from datetime import datetime, timedelta
@@ -17,16 +13,14 @@ from pydantic import Field
 from biresnerf.errors import InputError
 from biresnerf.wire.base import Record
 from workers.database.database import Database
-from workers.database.ids import CROCKFORD, new_id
+from workers.database.ids import new_id
 from workers.records import record_from_row
 from workers.tenants.tenants import ensure_tenant
+from workers.tenants.tokens import living_row, new_token
 
 Scope = Literal["read", "datasets:write", "jobs:write", "admin"]
 ALL_SCOPES: frozenset[Scope] = frozenset(get_args(Scope))
 USUAL_SCOPES: tuple[Scope, ...] = ("read", "datasets:write", "jobs:write")
-# `brn_`, ten characters that may be shown, and 256 random bits.
-_FORM = re.compile(r"(brn_[0-9A-Z]{10})_[A-Za-z0-9_-]{43}", re.ASCII)
-_NOBODY = bytes(32)
 # Not a write for each request of a busy client.
 _USED_EVERY_S = 60
 # How long "no key was made yet" is believed.
@@ -77,40 +71,32 @@ class KeyStore:
                 f"The scopes of a key are some of {', '.join(sorted(ALL_SCOPES))}.",
                 where="scopes",
             )
-        prefix = "brn_" + "".join(secrets.choice(CROCKFORD) for _ in range(10))
-        text = f"{prefix}_{secrets.token_urlsafe(32)}"
+        prefix, text, sha256 = new_token("brn")
         async with self._database.transaction() as connection:
             await ensure_tenant(connection, tenant)
             row = await connection.only_row(
                 "INSERT INTO api_keys (id, tenant, name, prefix, sha256, scopes, expires_at)"
                 " VALUES (%s, %s, %s, %s, %s, %s, clock_timestamp() + %s::interval) RETURNING *",
-                *(new_id("key"), tenant, name, prefix, _digest(text), wanted, lives),
+                *(new_id("key"), tenant, name, prefix, sha256, wanted, lives),
             )
         self._any_made = True
         return _key(row), text
 
     async def recognise(self, text: str) -> ApiKey:
         """The living key with this text; notes its use. Raises `KeyRefused`."""
-        form = _FORM.fullmatch(text)
-        rows = (
-            await self._database.fetch(
-                "SELECT *, revoked_at IS NULL AND coalesce(expires_at > clock_timestamp(), true) AS living,"
-                " coalesce(last_used_at < clock_timestamp() - make_interval(secs => %s), true) AS stale"
-                " FROM api_keys WHERE prefix = %s",
-                *(_USED_EVERY_S, form[1]),
-            )
-            if form
-            else []
+        select = (
+            "SELECT *, revoked_at IS NULL AND coalesce(expires_at > clock_timestamp(), true) AS living,"
+            " coalesce(last_used_at < clock_timestamp() - make_interval(secs => %s), true) AS stale"
+            " FROM api_keys WHERE prefix = %s"
         )
-        # The same work whether the prefix is known or not; equal in time for each wrong digest.
-        same = hmac.compare_digest(_digest(text), rows[0]["sha256"] if rows else _NOBODY)
-        if not same or not rows or not rows[0]["living"]:
+        row = await living_row(self._database, "brn", text, select, _USED_EVERY_S)
+        if row is None:
             raise KeyRefused
-        if rows[0]["stale"]:
+        if row["stale"]:
             await self._database.fetch(
-                "UPDATE api_keys SET last_used_at = clock_timestamp() WHERE id = %s", rows[0]["id"]
+                "UPDATE api_keys SET last_used_at = clock_timestamp() WHERE id = %s", row["id"]
             )
-        return _key(rows[0])
+        return _key(row)
 
     async def any_made(self) -> bool:
         """Whether a key was ever made. A revoked one counts: revoking the last must not open the doors.
@@ -143,11 +129,6 @@ class KeyStore:
         sql = "UPDATE api_keys SET revoked_at = coalesce(revoked_at, clock_timestamp()) WHERE id = %s RETURNING *"
         async with self._database.transaction() as connection:
             return _key(await connection.required_row(f"No key {key_id}.", sql, key_id))
-
-
-def _digest(text: str) -> bytes:
-    # No slow hash: 256 random bits cannot be guessed, however fast one tries.
-    return hashlib.sha256(text.encode()).digest()
 
 
 def _key(row: dict[str, Any]) -> ApiKey:

@@ -13,7 +13,7 @@ from biresnerf.errors import InputError
 from workers.engine import Stores, open_stores
 from workers.settings.errors import NotFound, Unavailable
 from workers.settings.settings import Settings
-from workers.tenants import api_keys
+from workers.tenants import api_keys, tokens
 from workers.tenants.api_keys import KeyRefused
 
 pytestmark = pytest.mark.anyio
@@ -71,7 +71,7 @@ async def test_digests_are_compared_in_constant_time_whether_the_prefix_is_known
         compared.append((len(left), len(right)))
         return compare(left, right)
 
-    monkeypatch.setattr(api_keys.hmac, "compare_digest", watched)
+    monkeypatch.setattr(tokens.hmac, "compare_digest", watched)
     for wrong in (text[:-1] + ("A" if text[-1] != "A" else "B"), "brn_0000000000_" + "x" * 43, "nonsense"):
         with pytest.raises(KeyRefused):
             await stores.keys.recognise(wrong)
