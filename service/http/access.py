@@ -36,7 +36,6 @@ from workers.settings.settings import Settings
 from workers.tenants.api_keys import ALL_SCOPES, KeyRefused
 from workers.tenants.api_keys import Scope as KeyScope
 from workers.tenants.tenants import LOCAL_TENANT
-from workers.tenants.token_buckets import TokenBuckets
 from workers.webhooks.webhooks import WebhookStore
 
 log = logging.getLogger(__name__)
@@ -58,25 +57,6 @@ _CHALLENGE = 'Bearer realm="biresnerf"'
 
 
 @dataclass(frozen=True)
-class Allowance:
-    """What a client has left. ``wait_s`` is 0 if the request is allowed, else the seconds until the next one is."""
-
-    policy: str
-    limit: int
-    remaining: int
-    full_in_s: int
-    wait_s: int
-
-    def headers(self) -> dict[str, str]:
-        """The headers of draft-ietf-httpapi-ratelimit-headers."""
-        window_s = max(1, self.full_in_s)
-        return {
-            "RateLimit-Policy": f'"{self.policy}";q={self.limit}',
-            "RateLimit": f'"{self.policy}";r={self.remaining};t={window_s}',
-        }
-
-
-@dataclass(frozen=True)
 class RateLimit:
     """At most ``burst`` requests of one client at once, and ``rate`` a second on average, in all web processes."""
 
@@ -84,16 +64,26 @@ class RateLimit:
     rate: float
     burst: int
 
-    async def take(self, buckets: TokenBuckets, client: str) -> Allowance:
-        """Counts a request, if it is allowed; raises `Unavailable`."""
-        level = await buckets.take(self.policy, client, self.rate, self.burst)
-        return Allowance(
-            policy=self.policy,
-            limit=self.burst,
-            remaining=int(level.tokens),
-            full_in_s=math.ceil(level.full_in_s),
-            wait_s=math.ceil(level.wait_s),
-        )
+    async def take(self, request: Request, client: str) -> dict[str, str]:
+        """Counts a request, and says what is left by the headers of draft-ietf-httpapi-ratelimit-headers.
+
+        Raises:
+            ProblemError: ``rate_limited``: the request is one too many.
+            Unavailable: the database does not answer.
+        """
+        level = await service_of(request).stores.buckets.take(self.policy, client, self.rate, self.burst)
+        window_s = max(1, math.ceil(level.full_in_s))
+        headers = {
+            "RateLimit-Policy": f'"{self.policy}";q={self.burst}',
+            "RateLimit": f'"{self.policy}";r={int(level.tokens)};t={window_s}',
+        }
+        if level.wait_s:
+            raise ProblemError(
+                "rate_limited",
+                f"At most {self.burst} requests are taken at once.",
+                headers={**headers, "Retry-After": str(math.ceil(level.wait_s))},
+            )
+        return headers
 
 
 @dataclass(frozen=True)
@@ -154,26 +144,23 @@ class Access:
             return
         request = Request(scope)
         try:
-            allowance = await self._allowance(request)
+            left = await self._left(request)
         except Unavailable as error:  # above the routes: no exception handler responds with 503
             raise problem_of(error) from None
-        if allowance is None:
-            await self._app(scope, receive, send)
-            return
 
-        async def send_with_allowance(message: Message) -> None:
+        async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
-                MutableHeaders(scope=message).update(allowance.headers())
+                MutableHeaders(scope=message).update(left)
             await send(message)
 
-        await self._app(scope, receive, send_with_allowance)
+        await self._app(scope, receive, send_with_headers)
 
-    async def _allowance(self, request: Request) -> Allowance | None:
-        """What the client, who is identified here, has left; none where it has no limit."""
+    async def _left(self, request: Request) -> dict[str, str]:
+        """What the client, who is identified here, has left, as headers; none where it has no limit."""
         request.state.identity = identity = await self._identified(request)
         anonymous = None if on_loopback(self._settings.host) else _address(request)
         request.state.client = client = identity.key_id or anonymous
-        return None if client is None else await _take(self._keys, request, client)
+        return {} if client is None else await self._keys.take(request, client)
 
     async def _identified(self, request: Request) -> Identity:
         try:
@@ -181,19 +168,8 @@ class Access:
         except ProblemError as refusal:
             # A valid key is never limited by what others send from the same address.
             if refusal.status == 401:
-                await _take(self._unidentified, request, _address(request))
+                await self._unidentified.take(request, _address(request))
             raise
-
-
-async def _take(limit: RateLimit, request: Request, client: str) -> Allowance:
-    allowance = await limit.take(service_of(request).stores.buckets, client)
-    if allowance.wait_s:
-        raise ProblemError(
-            "rate_limited",
-            f"At most {allowance.limit} requests are taken at once.",
-            headers={**allowance.headers(), "Retry-After": str(allowance.wait_s)},
-        )
-    return allowance
 
 
 def _address(request: Request) -> str:
@@ -216,8 +192,9 @@ async def identify(service: Service, request: Request) -> Identity:
         found = await service.stores.links.recognise(bearer[1])
         if found is None:
             raise _unknown("The link is unknown, expired or revoked.")
-        require_shown(found.link.job_id, request.method, request.scope["path"])
-        return Identity(found.tenant, frozenset({"read"}), found.link.id, found.link)
+        link, tenant = found
+        require_shown(link.job_id, request.method, request.scope["path"])
+        return Identity(tenant, frozenset({"read"}), link.id, link)
     try:
         key = await service.stores.keys.recognise(bearer[1])
     except KeyRefused:
