@@ -6,7 +6,6 @@ import asyncio
 import hashlib
 import logging
 import uuid
-from collections.abc import AsyncIterator
 from functools import partial
 from pathlib import Path
 
@@ -27,7 +26,6 @@ from workers.store.measured_stream import MeasuredStream
 logger = logging.getLogger(__name__)
 
 RATIO_MAX = 200.0
-_CHUNK = 2**20
 # Between two looks at an upload that another process stores, and at those that are being fetched.
 _POLL_S, _FETCH_POLL_S = 0.3, 1.0
 # A folder of this name is part of the dataset, even if it is the only one in the archive.
@@ -47,9 +45,9 @@ async def import_archive(
     datasets = service.stores.datasets
     async with datasets.importing(dataset_id):
         root = await _unpacked(service, dataset_id, archive, upload_id)
-        files = await asyncio.to_thread(_files_below, root)
-        contents = {path.relative_to(root).as_posix(): partial(_chunks, path) for path in files}
-        await datasets.add_files(dataset_id, contents, upload_id=upload_id)
+        found = await asyncio.to_thread(_files_below, root)
+        files = {path.relative_to(root).as_posix(): path for path in found}
+        await datasets.add_files(dataset_id, files, upload_id=upload_id)
     return await datasets.get(dataset_id)
 
 
@@ -191,9 +189,3 @@ def file_sha256(path: Path) -> str:
     """The file's SHA-256, in hex."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-async def _chunks(path: Path) -> AsyncIterator[bytes]:
-    with path.open("rb") as file:
-        while chunk := await asyncio.to_thread(file.read, _CHUNK):
-            yield chunk

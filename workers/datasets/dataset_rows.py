@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from biresnerf.errors import InputError
 from biresnerf.wire.datasets import DatasetState
@@ -12,7 +12,6 @@ from workers.records import DatasetFile
 from workers.settings.errors import Conflict, LimitReached
 from workers.settings.settings import Settings
 from workers.store.files import StoredFile
-from workers.store.trash import discard
 
 DATASET = """
     SELECT datasets.*, coalesce(total.files, 0) AS files, coalesce(total.bytes, 0)::bigint AS bytes,
@@ -42,75 +41,33 @@ KNOWN = f"""
 RESERVED_NAME = re.compile(r"#\d+$")
 
 
-async def record_file(
-    connection: Connection, dataset_id: str, path: str, stored: StoredFile, upload_id: str | None = None
-) -> tuple[DatasetFile, bool]:
-    """Make a stored file the dataset's at ``path``; also tells whether the path is new. What was there is trash.
-
-    ``upload_id``: the upload that brought it.
-    """
-    if upload_id is not None:
-        await connection.execute(
-            "UPDATE uploads SET brought = least(size, brought + %s) WHERE id = %s", (stored.size, upload_id)
-        )
-    before = await connection.row(
-        "DELETE FROM dataset_files WHERE dataset_id = %s AND path = %s RETURNING key", dataset_id, path
-    )
-    if before is not None:
-        await discard(connection, before["key"].removesuffix(f"/{path}"))
-    cursor = await connection.execute(
-        "INSERT INTO dataset_files (dataset_id, path, key, size, sha256) VALUES (%s, %s, %s, %s, %s)"
-        " RETURNING path, key, size, sha256, created_at",
-        (dataset_id, path, stored.key, stored.size, stored.sha256),
-    )
-    await connection.execute("UPDATE datasets SET revision = revision + 1 WHERE id = %s", (dataset_id,))
-    return DatasetFile.model_validate(await cursor.fetchone()), before is None
-
-
 async def record_files(
-    connection: Connection,
-    settings: Settings,
-    dataset_id: str,
-    stored: Mapping[str, StoredFile],
-    upload_id: str | None = None,
-) -> None:
+    connection: Connection, dataset_id: str, stored: Mapping[str, StoredFile], upload_id: str | None
+) -> tuple[list[DatasetFile], int]:
     """Make stored files, by their paths, the dataset's, whose row is locked. What was there is trash.
 
-    Raises `LimitReached` (``too_many_files``, ``body_too_large``).
+    ``upload_id``: the upload that brought them. Returns the files, and how many took the place of another.
     """
     paths, files = list(stored), list(stored.values())
-    total = sum(file.size for file in files)
-    others = await connection.only_row(
-        "SELECT count(*) AS files, coalesce(sum(size), 0)::bigint AS bytes"
-        " FROM dataset_files WHERE dataset_id = %s AND path <> ALL(%s)",
-        *(dataset_id, paths),
-    )
-    _require_limits(settings, others["files"] + len(paths), others["bytes"] + total)
     if upload_id is not None:
         await connection.execute(
-            "UPDATE uploads SET brought = least(size, brought + %s) WHERE id = %s", (total, upload_id)
+            "UPDATE uploads SET brought = least(size, brought + %s) WHERE id = %s",
+            (sum(file.size for file in files), upload_id),
         )
-    await connection.execute(
+    replaced = await connection.execute(
         "WITH gone AS (DELETE FROM dataset_files WHERE dataset_id = %s AND path = ANY(%s) RETURNING path, key)"
         " INSERT INTO trash (prefix) SELECT left(key, length(key) - length(path) - 1) FROM gone",
         (dataset_id, paths),
     )
-    await connection.execute(
+    recorded = await connection.rows(
         "INSERT INTO dataset_files (dataset_id, path, key, size, sha256)"
-        " SELECT %s, * FROM unnest(%s::text[], %s::text[], %s::bigint[], %s::text[])",
-        (
-            *(dataset_id, paths, [file.key for file in files]),
-            *([file.size for file in files], [file.sha256 for file in files]),
-        ),
+        " SELECT %s, * FROM unnest(%s::text[], %s::text[], %s::bigint[], %s::text[])"
+        " RETURNING path, key, size, sha256, created_at",
+        *(dataset_id, paths, [file.key for file in files]),
+        *([file.size for file in files], [file.sha256 for file in files]),
     )
     await connection.execute("UPDATE datasets SET revision = revision + 1 WHERE id = %s", (dataset_id,))
-
-
-def _require_limits(settings: Settings, files: int, size: int) -> None:
-    if files > settings.max_files:
-        raise LimitReached("too_many_files", f"A dataset holds at most {settings.max_files} files.")
-    if size > settings.max_dataset_bytes:
-        raise LimitReached("body_too_large", f"A dataset holds at most {settings.max_dataset_bytes} bytes.")
+    return [DatasetFile.model_validate(row) for row in recorded], replaced.rowcount
 
 
 async def require_open(connection: Connection, dataset_id: str, tenant: str | None) -> None:
@@ -120,23 +77,32 @@ async def require_open(connection: Connection, dataset_id: str, tenant: str | No
         raise Conflict("dataset_not_open", f"Dataset {dataset_id} is {state}; it takes no more files.")
 
 
-async def require_place(
-    connection: Connection, settings: Settings, dataset_id: str, path: str, overwrite: bool, size: int
+async def require_places(
+    connection: Connection,
+    settings: Settings,
+    dataset_id: str,
+    paths: Sequence[str],
+    size: int,
+    *,
+    overwrite: bool,
 ) -> int:
-    """That ``path`` may be a file of ``size`` bytes; returns the bytes of the dataset's other files.
+    """That ``paths`` may be files of ``size`` bytes in all; returns the bytes of the dataset's other files.
 
     Raises `Conflict` (``file_exists``), `LimitReached` (``too_many_files``, ``body_too_large``).
     """
-    row = await connection.only_row(
-        "SELECT count(*) FILTER (WHERE path <> %s) AS files, count(*) FILTER (WHERE path = %s) AS same,"
-        " coalesce(sum(size) FILTER (WHERE path <> %s), 0)::bigint AS bytes"
+    there = await connection.only_row(
+        "SELECT count(*) FILTER (WHERE path <> ALL(%s)) AS files, min(path) FILTER (WHERE path = ANY(%s)) AS same,"
+        " coalesce(sum(size) FILTER (WHERE path <> ALL(%s)), 0)::bigint AS bytes"
         " FROM dataset_files WHERE dataset_id = %s",
-        *(path, path, path, dataset_id),
+        *([*paths], [*paths], [*paths], dataset_id),
     )
-    if row["same"] and not overwrite:
-        raise Conflict("file_exists", f"{path} is there already.")
-    _require_limits(settings, row["files"] + 1, row["bytes"] + size)
-    return int(row["bytes"])
+    if there["same"] is not None and not overwrite:
+        raise Conflict("file_exists", f"{there['same']} is there already.")
+    if there["files"] + len(paths) > settings.max_files:
+        raise LimitReached("too_many_files", f"A dataset holds at most {settings.max_files} files.")
+    if there["bytes"] + size > settings.max_dataset_bytes:
+        raise LimitReached("body_too_large", f"A dataset holds at most {settings.max_dataset_bytes} bytes.")
+    return int(there["bytes"])
 
 
 async def lock_dataset(connection: Connection, dataset_id: str, tenant: str | None) -> DatasetState:

@@ -6,13 +6,15 @@ import asyncio
 import contextlib
 import uuid
 from collections.abc import AsyncIterable, AsyncIterator, Awaitable, Callable, Mapping, Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeAlias
 
 from psycopg.types.json import Jsonb
 
 from biresnerf.errors import InputError
 from biresnerf.wire.base import Page
 from biresnerf.wire.datasets import DatasetState, DatasetView, ManifestEntry
+from workers.database.claimed_work import lease_renewed
 from workers.database.database import Connection, Database, OwnedStore
 from workers.database.ids import cursor_place, new_id
 from workers.datasets.dataset_check import Checker
@@ -23,10 +25,9 @@ from workers.datasets.dataset_rows import (
     UNUSED,
     file_key,
     lock_dataset,
-    record_file,
     record_files,
     require_open,
-    require_place,
+    require_places,
 )
 from workers.jobs.job_rows import jobs_of_dataset
 from workers.jobs.quotas import require_byte_quota
@@ -39,6 +40,8 @@ from workers.store.trash import delete_unless_rescued, discard, rescue
 from workers.tenants.tenants import LOCAL_TENANT
 
 COPIES_AT_ONCE = 8
+# Stores a file under a key, in so many bytes at most.
+_Store: TypeAlias = Callable[[str, int], Awaitable[StoredFile]]
 FILE = "SELECT path, key, size, sha256, created_at FROM dataset_files"
 
 
@@ -113,64 +116,41 @@ class DatasetStore(OwnedStore):
         async def stored(key: str, room: int) -> StoredFile:
             return await self._files.put(key, chunks, limit_bytes=room, expected_sha256=sha256)
 
-        return await self._add(dataset_id, path, stored, upload_id, overwrite=overwrite)
+        return await self._add_one(dataset_id, path, stored, upload_id, overwrite=overwrite)
 
     async def add_files(
-        self,
-        dataset_id: str,
-        contents: Mapping[str, Callable[[], AsyncIterable[bytes]]],
-        *,
-        upload_id: str | None = None,
+        self, dataset_id: str, files: Mapping[str, Path], *, upload_id: str | None = None
     ) -> None:
-        """Store files under their relative paths: all, or none where one cannot be.
+        """Store local files under their relative paths: all, or none where one cannot be.
 
         Raises as `add_file` does. A file that is there is replaced.
         """
-        folder = f"datasets/{dataset_id}/files/{new_id('v')}"
-        # A folder for each: the one of a file that is replaced goes to the trash.
-        keys = {path: file_key(f"{folder}/{number}", path) for number, path in enumerate(contents)}
-        async with self._database.transaction() as connection:
-            await require_open(connection, dataset_id, self._tenant)
-            await require_byte_quota(connection, dataset_id, 1 if upload_id is None else 0)
-            await discard(connection, folder, after_s=self._settings.upload_expiry_s)
-        limit, stored = self._settings.max_file_bytes, {}
-        try:
-            for path, content in contents.items():
-                stored[path] = await self._files.put(keys[path], content(), limit_bytes=limit)
-            async with self._database.transaction() as connection:
-                await require_open(connection, dataset_id, self._tenant)
-                await rescue(connection, folder)
-                await record_files(connection, self._settings, dataset_id, stored, upload_id)
-                await require_byte_quota(connection, dataset_id, 0)
-        except BaseException:
-            await delete_unless_rescued(self._database, self._files, folder)
-            raise
+        # The file store's part, for each: its key and what room there is.
+        storing = {
+            path: (lambda key, room, file=file: self._files.put_path(key, file, limit_bytes=room))
+            for path, file in files.items()
+        }
+        await self._add(dataset_id, storing, upload_id, overwrite=True)
 
     @contextlib.asynccontextmanager
     async def importing(self, dataset_id: str) -> AsyncIterator[None]:
         """While inside, `being_imported` says so, also to other processes."""
         token = uuid.uuid4()
 
-        async def sign_of_life() -> None:
+        async def sign_of_life() -> bool:
             await self._database.fetch(
                 "INSERT INTO dataset_imports (token, dataset_id, live_until)"
                 " SELECT %s, id, clock_timestamp() + make_interval(secs => %s) FROM datasets WHERE id = %s"
                 " ON CONFLICT (token) DO UPDATE SET live_until = excluded.live_until",
                 *(token, 2 * self._settings.beat_s, dataset_id),
             )
-
-        async def go_on() -> None:
-            while True:
-                await asyncio.sleep(self._settings.beat_s / 2)
-                with contextlib.suppress(Unavailable):  # the next time will do
-                    await sign_of_life()
+            return True
 
         await sign_of_life()
-        living = asyncio.create_task(go_on())
         try:
-            yield
+            async with lease_renewed(sign_of_life, 2 * self._settings.beat_s):
+                yield
         finally:
-            living.cancel()
             with contextlib.suppress(Unavailable):  # then it ends by itself
                 await self._database.fetch("DELETE FROM dataset_imports WHERE token = %s", token)
 
@@ -210,7 +190,7 @@ class DatasetStore(OwnedStore):
                 )
             return file.model_copy(update={"sha256": found})
 
-        return await self._add(dataset_id, path, copied, upload_id, overwrite=True)
+        return await self._add_one(dataset_id, path, copied, upload_id, overwrite=True)
 
     async def fill_known(self, dataset_id: str) -> DatasetView:
         """Copy what the manifest names and the same tenant has sent before; returns the dataset.
@@ -237,43 +217,48 @@ class DatasetStore(OwnedStore):
                 copying.cancel()
         return await self.get(dataset_id)
 
-    async def _add(
-        self,
-        dataset_id: str,
-        path: str,
-        store: Callable[[str, int], Awaitable[StoredFile]],
-        upload_id: str | None,
-        *,
-        overwrite: bool,
+    async def _add_one(
+        self, dataset_id: str, path: str, store: _Store, upload_id: str | None, *, overwrite: bool
     ) -> tuple[DatasetFile, bool]:
+        (file,), replaced = await self._add(dataset_id, {path: store}, upload_id, overwrite=overwrite)
+        return file, not replaced
+
+    async def _add(
+        self, dataset_id: str, storing: Mapping[str, _Store], upload_id: str | None, *, overwrite: bool
+    ) -> tuple[Sequence[DatasetFile], int]:
+        """The files, and how many took the place of another."""
         # A folder of its own for each upload: one that fails or comes too late never touches an older file.
         folder = f"datasets/{dataset_id}/files/{new_id('v')}"
-        key = file_key(folder, path)
+        # And one for each of its files: that of a file that is replaced goes to the trash.
+        keys = {path: file_key(f"{folder}/{number}", path) for number, path in enumerate(storing)}
+        paths, stored = list(storing), {}
         async with self._database.transaction() as connection:
-            there = await self._require_place(connection, dataset_id, path, overwrite)
+            await require_open(connection, dataset_id, self._tenant)
+            there = await require_places(
+                connection, self._settings, dataset_id, paths, 0, overwrite=overwrite
+            )
             await require_byte_quota(connection, dataset_id, 1 if upload_id is None else 0)
-            # Until the file is recorded: this process may be killed before that.
+            # Until the files are recorded: this process may be killed before that.
             await discard(connection, folder, after_s=self._settings.upload_expiry_s)
         room = min(self._settings.max_file_bytes, self._settings.max_dataset_bytes - there)
         try:
-            stored = await store(key, room)
+            for path, store in storing.items():
+                stored[path] = await store(keys[path], room)
+            total = sum(file.size for file in stored.values())
             async with self._database.transaction() as connection:
-                await self._require_place(connection, dataset_id, path, overwrite, stored.size)
+                await require_open(connection, dataset_id, self._tenant)
+                await require_places(
+                    connection, self._settings, dataset_id, paths, total, overwrite=overwrite
+                )
                 await rescue(connection, folder)
-                recorded = await record_file(connection, dataset_id, path, stored, upload_id)
-                # All is counted now, also what the file replaced and what the upload has left.
+                recorded = await record_files(connection, dataset_id, stored, upload_id)
+                # All is counted now, also what the files replaced and what the upload has left.
                 await require_byte_quota(connection, dataset_id, 0)
                 return recorded
         except BaseException:
-            # Not where it was recorded and only the acknowledgement was lost.
+            # Not where they were recorded and only the acknowledgement was lost.
             await delete_unless_rescued(self._database, self._files, folder)
             raise
-
-    async def _require_place(
-        self, connection: Connection, dataset_id: str, path: str, overwrite: bool, size: int = 0
-    ) -> int:
-        await require_open(connection, dataset_id, self._tenant)
-        return await require_place(connection, self._settings, dataset_id, path, overwrite, size)
 
     async def file(self, dataset_id: str, path: str) -> DatasetFile:
         """One file; raises `NotFound`."""

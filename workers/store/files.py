@@ -109,15 +109,29 @@ class FileStore:
 
         return await self.put(key, chunks(), limit_bytes=len(content))
 
-    async def put_path(self, key: str, path: Path, media_type: str | None = None) -> StoredFile:
-        """Store a local file. The file is opened once, so a writer that renames over it does not disturb."""
+    async def put_path(
+        self,
+        key: str,
+        path: Path,
+        media_type: str | None = None,
+        *,
+        limit_bytes: int = 2**62,
+        expected_sha256: str | None = None,
+    ) -> StoredFile:
+        """Store a local file, as `put` does. It is opened once, so a writer that renames over it does not disturb."""
         with path.open("rb") as file:
 
             async def chunks() -> AsyncIterator[bytes]:
                 while chunk := await asyncio.to_thread(file.read, CHUNK_BYTES):
                     yield chunk
 
-            return await self.put(key, chunks(), limit_bytes=2**62, media_type=media_type)
+            return await self.put(
+                key,
+                chunks(),
+                limit_bytes=limit_bytes,
+                expected_sha256=expected_sha256,
+                media_type=media_type,
+            )
 
     async def copy(self, source: str, target: str) -> StoredFile:
         """A copy that the store makes by itself; raises `NotFound` where there is no ``source``."""

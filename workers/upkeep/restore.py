@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import subprocess
 import tempfile
-from collections.abc import AsyncIterator
 from pathlib import Path
 
 import psycopg
@@ -16,7 +15,7 @@ from workers.database.migrate import migrate
 from workers.jobs.job_expiry import FORGET_CHECKPOINTS
 from workers.settings.errors import SetupError
 from workers.settings.settings import Settings
-from workers.store.files import CHUNK_BYTES, FileStore, open_files
+from workers.store.files import FileStore, open_files
 from workers.upkeep.backup_folder import (
     BackupIndex,
     connection_of,
@@ -126,13 +125,7 @@ async def _require_own_store(store: FileStore, folder: Path) -> None:
 
 async def _put_back(store: FileStore, folder: Path, key: str, sha256: str) -> bool:
     try:
-        await store.put(key, _chunks(path_in(folder, key)), limit_bytes=2**62, expected_sha256=sha256)
+        await store.put_path(key, path_in(folder, key), expected_sha256=sha256)
     except (InputError, FileNotFoundError):
         return False
     return True
-
-
-async def _chunks(path: Path) -> AsyncIterator[bytes]:
-    with path.open("rb") as file:
-        while chunk := await asyncio.to_thread(file.read, CHUNK_BYTES):
-            yield chunk
