@@ -86,9 +86,7 @@ class Client:
     delete_dataset = _blocking(AsyncClient.delete_dataset)
 
     send = _blocking(AsyncClient.send)
-    send_addresses = _blocking(AsyncClient.send_addresses)
     submit = _blocking(AsyncClient.submit)
-    submit_addresses = _blocking(AsyncClient.submit_addresses)
     create_job = _blocking(AsyncClient.create_job)
     job = _blocking(AsyncClient.job)
     jobs = _blocking(AsyncClient.jobs)

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import anyio
-
 from biresnerf.client.errors import ServiceError
-from biresnerf.client.transport import Call, Transport, parse
+from biresnerf.client.transport import Call, Transport, looks, parse
 from biresnerf.wire.datasets import (
     DatasetList,
     DatasetState,
@@ -23,7 +21,6 @@ from biresnerf.wire.datasets import (
     dataset_url,
 )
 
-_POLL_S, _LONGEST_POLL_S = 0.2, 3.0
 _ADDRESSES_AT_ONCE = 100  # a body of them is limited to 1 MiB
 
 
@@ -75,10 +72,9 @@ class DatasetCalls(Transport):
         """
         call = Call("POST", f"{dataset_url(dataset_id)}/finalize", headers={"Prefer": "respond-async"})
         found = parse(await self._ask(call), DatasetView)
-        pause_s = _POLL_S
-        while found.state == "finalizing":
-            await anyio.sleep(pause_s)
-            pause_s = min(1.5 * pause_s, _LONGEST_POLL_S)
+        async for _ in looks():
+            if found.state != "finalizing":
+                break
             found = await self.dataset(dataset_id)
         if found.state == "rejected":
             if found.error is None:

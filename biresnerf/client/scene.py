@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from biresnerf.errors import InputError
@@ -12,18 +11,11 @@ from biresnerf.wire.safe_paths import NameSet, checked_path
 TRANSFORMS = "transforms.json"
 
 
-@dataclass(frozen=True)
-class Scene:
-    """Files to send, as (name in the dataset, local path), and the sum of their bytes."""
-
-    files: tuple[tuple[str, Path], ...]
-    total_bytes: int
-
-
-def look_at(path: Path, video_frames: int = 0) -> Scene:
+def look_at(path: Path, video_frames: int = 0) -> list[tuple[str, Path]]:
     """The files that make up the input at ``path``: poses with the images and masks they name, or images alone.
 
-    Of videos it is the frames, as many as the option ``video_frames`` says, which are written beside them.
+    Each comes with its name in the dataset. Of videos it is the frames, as many as the option ``video_frames`` says,
+    which are written beside them.
 
     Raises:
         InputError: the input cannot be used, or an image is outside its folder.
@@ -48,7 +40,11 @@ def look_at(path: Path, video_frames: int = 0) -> Scene:
     elif dataset.source.files and not path.is_dir():
         poses = _found_by_name(root, path, poses)
     places = [(file.name, file) for file in (*position_files(root), *control_files(root))]
-    return _scene([*poses, *places, *((_name_below(root, file), file) for file in images + masks)])
+    files = [*poses, *places, *((_name_below(root, file), file) for file in images + masks)]
+    names = NameSet()
+    for sent_as, _ in files:
+        names.add(sent_as)
+    return files
 
 
 def _found_by_name(root: Path, path: Path, poses: list[tuple[str, Path]]) -> list[tuple[str, Path]]:
@@ -71,10 +67,3 @@ def _name_below(root: Path, path: Path) -> str:
             hint="Move it below that folder, or run `biresnerf refine` on this machine.",
         ) from None
     return checked_path(name)
-
-
-def _scene(files: list[tuple[str, Path]]) -> Scene:
-    names = NameSet()
-    for name, _ in files:
-        names.add(name)
-    return Scene(tuple(files), sum(path.stat().st_size for _, path in files))

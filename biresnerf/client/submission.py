@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, Unpack
 
-import anyio
 from anyio import to_thread
 
 from biresnerf.client.dataset_calls import DatasetCalls
@@ -21,7 +20,7 @@ from biresnerf.client.job_calls import (
     with_name,
 )
 from biresnerf.client.scene import look_at
-from biresnerf.client.transport import tell
+from biresnerf.client.transport import looks, tell
 from biresnerf.client.uploads import LocalFile, Uploads
 from biresnerf.wire.datasets import DatasetView, FileAddress
 from biresnerf.wire.jobs import JobDetails, JobView, NewJob
@@ -39,15 +38,12 @@ class Sending:
     dataset_id: str | None = None
 
 
-_POLL_S, _LONGEST_POLL_S = 0.3, 5.0  # between two looks at what the service fetches
-
-
 class Submissions(DatasetCalls, JobCalls, Uploads):
     """Submits local folders, and files at addresses."""
 
     async def submit(
         self,
-        path: Path,
+        source: Path | Sequence[FileAddress],
         options: OptionsLike = None,
         *,
         name: str | None = None,
@@ -57,53 +53,32 @@ class Submissions(DatasetCalls, JobCalls, Uploads):
         on_progress: Callable[[Sending], object] = lambda _: None,
         **details: Unpack[JobDetails],
     ) -> JobView:
-        """Sends the missing files of a folder (or file with poses), has them checked, and queues a job.
+        """Sends the missing files of a set, or has all of them fetched, has them checked, and queues a job.
 
         If the service refuses the files, the dataset is deleted there. If the connection fails or the caller stops,
-        it stays: the same submission with ``resume`` sends the rest, or returns the job if it is queued already.
+        it stays: the same submission with ``resume`` sends the rest, or returns the job if it is queued already. What
+        the service fetches goes on without the caller.
 
         Args:
+            source: a folder (or file with poses), or addresses of files that the service fetches itself; see
+                `bucket_files` for those of a bucket.
             name: of the dataset, and of the job unless ``labels`` has a ``name``. Default: the folder's.
-            resume: the dataset of an interrupted submission.
+            resume: the dataset of an interrupted submission; addresses are not needed for it any more.
             on_progress: called at each step, and with the bytes sent.
             details: see `JobDetails`.
 
         Raises:
             InputError: the folder or the options cannot be used; nothing was sent then.
-            ServiceError: the service refuses, or cannot be reached.
+            ServiceError: the service refuses, or cannot be reached; also where an address leads to no file, or to
+                another one than was announced.
         """
-        body = _body(options, labels, details)
-        ready = await self.send(path, body.options, name=name, resume=resume, on_progress=on_progress)
-        return await self._queued(ready, body, idempotency_key, resume is None, on_progress)
-
-    async def submit_addresses(
-        self,
-        files: Sequence[FileAddress],
-        options: OptionsLike = None,
-        *,
-        name: str = "scene",
-        labels: Mapping[str, str] | None = None,
-        idempotency_key: str | None = None,
-        resume: str | None = None,
-        on_progress: Callable[[Sending], object] = lambda _: None,
-        **details: Unpack[JobDetails],
-    ) -> JobView:
-        """Like `submit`, with files that the service fetches itself. It goes on without the caller.
-
-        Args:
-            files: where they are; see `bucket_files` for those of a bucket.
-            resume: the dataset of an interrupted submission, whose files are fetched already or soon.
-
-        Raises:
-            ServiceError: also where an address leads to no file, or to another one than was announced.
-        """
-        body = _body(options, labels, details)
-        ready = await self.send_addresses(files, name=name, resume=resume, on_progress=on_progress)
+        body = NewJob(dataset_id="", options=as_options(options), labels=dict(labels or {}), **details)
+        ready = await self.send(source, body.options, name=name, resume=resume, on_progress=on_progress)
         return await self._queued(ready, body, idempotency_key, resume is None, on_progress)
 
     async def send(
         self,
-        path: Path,
+        source: Path | Sequence[FileAddress],
         options: OptionsLike = None,
         *,
         name: str | None = None,
@@ -111,29 +86,22 @@ class Submissions(DatasetCalls, JobCalls, Uploads):
         on_progress: Callable[[Sending], object] = lambda _: None,
     ) -> DatasetView:
         """What `submit` does before it queues a job; ``options`` say which frames of a video are sent."""
-        await tell(on_progress, Sending("reading"))
-        files = await _local_files(path, as_options(options).video_frames)
+        files: list[LocalFile] = []
+        if isinstance(source, Path):
+            await tell(on_progress, Sending("reading"))
+            files = await _local_files(source, as_options(options).video_frames)
+            folder = source.resolve()
+            name = name or (folder.parent if folder.is_file() else folder).name
         if resume is None:
-            folder = path.resolve()
-            title = (name or (folder.parent if folder.is_file() else folder).name or "scene")[:200]
-            target = await self.create_dataset(title, [file.entry for file in files])
+            target = await self.create_dataset((name or "scene")[:200], [file.entry for file in files])
         else:
             target = await self.dataset(resume)
+        if target.state == "ready":  # the submission was interrupted after its check
+            return target
         async with self._discarding(target, resume is None):
-            return await self._fill(target, files, on_progress)
-
-    async def send_addresses(
-        self,
-        files: Sequence[FileAddress],
-        *,
-        name: str = "scene",
-        resume: str | None = None,
-        on_progress: Callable[[Sending], object] = lambda _: None,
-    ) -> DatasetView:
-        """What `submit_addresses` does before it queues a job."""
-        target = await (self.create_dataset(name[:200]) if resume is None else self.dataset(resume))
-        async with self._discarding(target, resume is None):
-            return await self._fetch(target, () if resume is not None else files, on_progress)
+            if isinstance(source, Path):
+                return await self._fill(target, files, on_progress)
+            return await self._fetch(target, source if resume is None else (), on_progress)
 
     async def _queued(
         self,
@@ -163,12 +131,13 @@ class Submissions(DatasetCalls, JobCalls, Uploads):
         self, target: DatasetView, files: Sequence[FileAddress], on_progress: Callable[[Sending], object]
     ) -> DatasetView:
         """Has the files fetched and the dataset checked."""
-        if target.state == "ready":
-            return target
         if files:
             await self.fetch_files(target.id, files)
-        pause_s, state = _POLL_S, Sending("fetching", len(files), dataset_id=target.id)
-        while pending := await self.fetches(target.id):
+        state = Sending("fetching", len(files), dataset_id=target.id)
+        async for _ in looks():
+            pending = await self.fetches(target.id)
+            if not pending:
+                break
             rejected = next((each.error for each in pending if each.error is not None), None)
             if rejected is not None:
                 raise ServiceError.of(rejected, status=422)
@@ -181,8 +150,6 @@ class Submissions(DatasetCalls, JobCalls, Uploads):
                 bytes_sent=total - sum(each.size - each.received for each in pending),
             )
             await tell(on_progress, state)
-            await anyio.sleep(pause_s)
-            pause_s = min(1.5 * pause_s, _LONGEST_POLL_S)
         await tell(on_progress, replace(state, step="checking"))
         return await self.finalize(target.id)
 
@@ -190,8 +157,6 @@ class Submissions(DatasetCalls, JobCalls, Uploads):
         self, target: DatasetView, files: list[LocalFile], on_progress: Callable[[Sending], object]
     ) -> DatasetView:
         """Sends the missing files and has the dataset checked."""
-        if target.state == "ready":  # the submission was interrupted after its check
-            return target
         missing = set(target.missing)
         sizes = [file.size for file in files if file.name in missing]
         state = Sending("sending", len(files), len(sizes), sum(sizes), dataset_id=target.id)
@@ -213,15 +178,9 @@ class Submissions(DatasetCalls, JobCalls, Uploads):
             cause.add_note(f"The dataset {target.id} remains on the service: {error}")
 
 
-def _body(options: OptionsLike, labels: Mapping[str, str] | None, details: JobDetails) -> NewJob:
-    """The job to queue once its dataset is there; raises `InputError` before anything is sent."""
-    return NewJob(dataset_id="", options=as_options(options), labels=dict(labels or {}), **details)
-
-
 async def _local_files(path: Path, video_frames: int) -> list[LocalFile]:
     """The files of the input at ``path``, with their digests; raises `InputError`."""
-    scene = await to_thread.run_sync(look_at, path, video_frames, abandon_on_cancel=True)
+    found = await to_thread.run_sync(look_at, path, video_frames, abandon_on_cancel=True)
     return [
-        await to_thread.run_sync(LocalFile.at, name, file, abandon_on_cancel=True)
-        for name, file in scene.files
+        await to_thread.run_sync(LocalFile.at, name, file, abandon_on_cancel=True) for name, file in found
     ]

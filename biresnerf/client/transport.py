@@ -22,6 +22,7 @@ from biresnerf.wire.base import Page
 _CHUNK_BYTES = 2**18
 _CONNECT_S, _WRITE_S, _ANSWER_S = 30.0, 120.0, 120.0
 _PAGE_ITEMS = 200
+_POLL_S, _LONGEST_POLL_S = 0.2, 5.0  # between two looks at what the service does
 # The service certainly did not receive the request.
 _NOT_SENT = (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout)
 Model = TypeVar("Model", bound=BaseModel)
@@ -187,6 +188,15 @@ async def tell(callback: Callable[..., object], *facts: object) -> None:
     answer = callback(*facts)
     if inspect.isawaitable(answer):
         await answer
+
+
+async def looks() -> AsyncIterator[None]:
+    """Again and again, with growing pauses: to look at what the service is doing."""
+    pause_s = _POLL_S
+    while True:
+        yield
+        await anyio.sleep(pause_s)
+        pause_s = min(1.5 * pause_s, _LONGEST_POLL_S)
 
 
 async def run_together(works: Iterable[Callable[[], Awaitable[object]]], at_once: int = 4) -> None:

@@ -15,13 +15,12 @@ import httpx
 
 from biresnerf.client.errors import ServiceError
 from biresnerf.client.retries import Retries
-from biresnerf.client.transport import Call, FilePart, Transport, parse, run_together, tell
+from biresnerf.client.transport import Call, FilePart, Transport, looks, parse, run_together, tell
 from biresnerf.wire.datasets import DatasetView, ManifestEntry, UploadView, dataset_url
 
 # Larger files are sent by resumable uploads; smaller ones are sent again as a whole.
 RESUMABLE_BYTES = 8 * 2**20
 _APPEND_S = 300.0
-_POLL_S, _LONGEST_POLL_S = 0.3, 5.0
 _TUS = {"Tus-Resumable": "1.0.0"}
 _OFFSET_TYPE = {"Content-Type": "application/offset+octet-stream"}
 
@@ -112,15 +111,12 @@ class Uploads(Transport):
         return begun.headers["location"]
 
     async def _until_stored(self, address: str) -> None:
-        pause_s = _POLL_S
-        while True:
+        async for _ in looks():
             upload = parse(await self._ask(Call("GET", address)), UploadView)
             if upload.state == "stored":
                 return
             if upload.error is not None:
                 raise ServiceError.of(upload.error, status=422)
-            await anyio.sleep(pause_s)
-            pause_s = min(1.5 * pause_s, _LONGEST_POLL_S)  # unpacking a large set takes a while
 
 
 class _SentBytes:

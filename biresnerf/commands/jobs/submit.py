@@ -158,19 +158,15 @@ def _submitted(client: Client, path: Path | str, options: RefineOptions, how: di
     After Ctrl-C it prints the command that resumes.
     """
     with _sending(again_as_it_is="resume" in how) as note:
-        if isinstance(path, Path):
-            return client.submit(path, options, on_progress=note, **how)
-        files = () if how.get("resume") else _files_at(path)
-        return client.submit_addresses(files, options, name=name_of(path), on_progress=note, **how)
+        source = () if "resume" in how and isinstance(path, str) else _source(path)
+        return client.submit(source, options, name=name_of(path), on_progress=note, **how)
 
 
 def _sent(client: Client, options: RefineOptions, name: str, path: Path | str) -> DatasetView:
     """One of several sets, checked."""
     click.echo(f"{name}:", err=True)
     with _sending(again_as_it_is=True) as note:
-        if isinstance(path, Path):
-            return client.send(path, options, name=name, on_progress=note)
-        return client.send_addresses(_files_at(path), name=name, on_progress=note)
+        return client.send(_source(path), options, name=name, on_progress=note)
 
 
 @contextmanager
@@ -196,7 +192,10 @@ def _sending(*, again_as_it_is: bool) -> Iterator[Callable[[Sending], None]]:
             raise click.exceptions.Exit(exit_codes.SIGINT) from None
 
 
-def _files_at(address: str) -> Sequence[FileAddress]:
+def _source(path: Path | str) -> Path | Sequence[FileAddress]:
+    """What the client submits: a local path as it is, an address as those of its files."""
     from biresnerf.client import FileAddress, bucket_files
 
-    return bucket_files(address) if address.startswith("s3://") else (FileAddress(url=address),)
+    if isinstance(path, Path):
+        return path
+    return bucket_files(path) if path.startswith("s3://") else (FileAddress(url=path),)

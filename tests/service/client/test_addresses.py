@@ -116,7 +116,7 @@ def test_an_address_that_leads_to_nothing_fails_by_name_and_leaves_no_dataset(
     (good,) = bucket_files(f"s3://{bucket.name}")
     bad = FileAddress(url=good.url.replace("a.jpg", "gone.jpg"), path="gone.jpg")
     with Client(service.url) as client, pytest.raises(ServiceError) as told:
-        client.submit_addresses([good, bad], FAST)
+        client.submit([good, bad], FAST)
     assert (told.value.code, told.value.where) == ("fetch_failed", "gone.jpg")
     assert dataset_ids(http) == before
 
