@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
@@ -127,25 +127,20 @@ def api_command(host: str | None, port: int | None, processes: int | None) -> No
 @click.option(
     "--idle-exit", type=click.FloatRange(min=0), metavar="SECONDS", help="End where no job came for so long."
 )
-def worker_command(slot: str, free_slot: str | None, one_job: bool, idle_exit: float | None) -> None:
+def worker_command(
+    slot: str, free_slot: Literal["cpu", "gpu"] | None, one_job: bool, idle_exit: float | None
+) -> None:
     """Run one worker slot, which runs one job at a time.
 
     Needs BIRESNERF_DATABASE_URL, and a database brought up to date by `biresnerf migrate`. Where CUDA_VISIBLE_DEVICES
     is set, jobs of a --free-slot gpu get that device, as batch systems give it. With --one-job the exit
     status says how the job ended, or that there was none; docs/operations.md lists the statuses.
     """
-    from workers.queue.slot import main
+    from workers.queue.slot import run_slot
 
     with setup_problems():
         settings_with().require_database_url()
-    sys.argv = ["biresnerf worker", "--slot", slot]
-    if free_slot is not None:
-        sys.argv += ["--free-slot", free_slot]
-    if one_job:
-        sys.argv += ["--one-job"]
-    if idle_exit is not None:
-        sys.argv += ["--idle-exit", str(idle_exit)]
-    sys.exit(main())
+    sys.exit(run_slot(slot, free_slot, one_job=one_job, idle_exit_s=idle_exit))
 
 
 @click.command("migrate")

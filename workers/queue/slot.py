@@ -209,35 +209,32 @@ class Slot:
         return variables
 
 
-def main() -> int:
-    """`python -m workers.queue.slot --slot NAME`, settings from the environment."""
-    parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("--slot", default="cpu0")
-    parser.add_argument("--free-slot", choices=("cpu", "gpu"))
-    parser.add_argument("--one-job", action="store_true")
-    parser.add_argument("--idle-exit", type=float, metavar="S")
-    given = parser.parse_args()
+def run_slot(
+    slot: str,
+    free_slot: Literal["cpu", "gpu"] | None = None,
+    *,
+    one_job: bool = False,
+    idle_exit_s: float | None = None,
+) -> ExitStatus:
+    """Run the slot of that name, or the first free one of a kind, with the settings of the environment; see `Slot`."""
 
     async def work(settings: Settings) -> ExitStatus:
-        if given.free_slot is None:
-            lock = SlotLock(settings.data_dir, given.slot)
-        else:
-            lock = lock_free_slot(settings.data_dir, given.free_slot)
+        lock = (
+            SlotLock(settings.data_dir, slot)
+            if free_slot is None
+            else lock_free_slot(settings.data_dir, free_slot)
+        )
         set_up_traces(lock.name, settings)
         gpu = re.fullmatch(r"gpu(\d+)", lock.name)
         # What gave the process a device of its own knows which; the free slot's number says nothing of it.
-        given_device = given.free_slot is not None and "CUDA_VISIBLE_DEVICES" in os.environ
-        slot = Slot(
-            settings,
-            lock,
-            gpu=gpu[1] if gpu and not given_device else None,
-            one_job=given.one_job,
-            idle_exit_s=given.idle_exit,
-        )
-        return await slot.run()
+        given_device = free_slot is not None and "CUDA_VISIBLE_DEVICES" in os.environ
+        device = gpu[1] if gpu and not given_device else None
+        return await Slot(settings, lock, gpu=device, one_job=one_job, idle_exit_s=idle_exit_s).run()
 
-    return run_process(given.free_slot or given.slot, work)
+    return run_process(free_slot or slot, work)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    parser = argparse.ArgumentParser(description="One slot, settings from the environment.")
+    parser.add_argument("--slot", default="cpu0")
+    sys.exit(run_slot(parser.parse_args().slot))
