@@ -14,6 +14,7 @@ from fastapi.responses import StreamingResponse
 from service.http.access import ReadCaller
 from service.http.dependencies import JobId, Service
 from service.http.problems import wrong_field
+from workers.process.waiting import first_done
 from workers.records import JobUpdate
 from workers.settings.errors import NotFound, Unavailable
 
@@ -116,16 +117,14 @@ async def _next_or_closing(
 ) -> JobUpdate | None:
     """The next update; raises ``StopAsyncIteration`` when there is none, or when the service stops."""
     update = asyncio.ensure_future(anext(updates))
-    waits = (update, asyncio.ensure_future(closing.wait()))
     try:
-        await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+        await first_done(update, closing.wait())
         if update.done():
             return update.result()
         raise StopAsyncIteration
     finally:
-        for wait in waits:
-            wait.cancel()
-        await asyncio.gather(*waits, return_exceptions=True)
+        update.cancel()
+        await asyncio.gather(update, return_exceptions=True)
 
 
 def _as_text(update: JobUpdate) -> str:

@@ -17,12 +17,13 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
+from psycopg.rows import DictRow
 from psycopg.types.json import Jsonb
 
 from biresnerf.wire.datasets import CheckReport
 from biresnerf.wire.problems import JobError
 from workers.database.claimed_work import lease_renewed
-from workers.database.database import Connection, Database
+from workers.database.database import Connection, Database, Statement
 from workers.database.losses import LOSSES_MAX, LostTooOften, at_an_end, counted
 from workers.process.disk_space import EXIT_DISK
 from workers.process.memory_limits import CHECK_VARIABLE, memory_limit, memory_shares
@@ -74,21 +75,21 @@ class Checker:
     async def check(self, dataset_id: str) -> None:
         """Returns once the dataset is not ``finalizing`` any more, after our check or another process's."""
         take = Take(dataset_id)
-        owned = await retry_while_unavailable(
-            lambda: self._database.fetch("SELECT tenant FROM datasets WHERE id = %s", dataset_id)
-        )
+        owned = await self._rows("SELECT tenant FROM datasets WHERE id = %s", dataset_id)
         if not owned:
             return
         while True:
             async with self._turns.turn(owned[0]["tenant"]):
                 if await retry_while_unavailable(lambda: self._take(take)):
                     await self._check(take)
-            rows = await retry_while_unavailable(
-                lambda: self._database.fetch("SELECT state FROM datasets WHERE id = %s", dataset_id)
-            )
+            rows = await self._rows("SELECT state FROM datasets WHERE id = %s", dataset_id)
             if not rows or rows[0]["state"] != "finalizing":
                 return
             await asyncio.sleep(LOOK_S)
+
+    async def _rows(self, statement: Statement, *values: object) -> list[DictRow]:
+        """Those of a statement; waits for a database that is away."""
+        return await retry_while_unavailable(lambda: self._database.fetch(statement, *values))
 
     async def unfinished(self) -> tuple[str, ...]:
         """Ids of ``finalizing`` datasets that no process checks; removes folders of processes that died."""
@@ -117,11 +118,7 @@ class Checker:
 
     async def _check(self, take: Take) -> None:
         dataset_id = take.dataset_id
-        rows = await retry_while_unavailable(
-            lambda: self._database.fetch(
-                "SELECT key, path FROM dataset_files WHERE dataset_id = %s", dataset_id
-            )
-        )
+        rows = await self._rows("SELECT key, path FROM dataset_files WHERE dataset_id = %s", dataset_id)
         shown = shown_key(dataset_id)
         try:
             async with lease_renewed(partial(self._take, take), 2 * self._settings.beat_s):
