@@ -10,11 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import median_low
 
+from pydantic import PositiveFloat, TypeAdapter
+
 from biresnerf.forecast.run_forecast import RATES, UNITS, Phase, Unit
 
 logger = logging.getLogger(__name__)
 
 RATES_FILE = "rates.json"
+_REMEMBERED = TypeAdapter(dict[str, dict[str, list[PositiveFloat]]])
 # Runs that are remembered; the middle one counts, so that two strange ones say nothing.
 KEPT = 5
 # A rate that is further from the general one is not believed. No general rates of GPUs are known.
@@ -89,17 +92,8 @@ def cache_folder() -> Path:
 
 
 def _read() -> dict[str, dict[str, list[float]]]:
+    """Of each machine the seconds of each unit, the latest run last; none where the file is damaged."""
     try:
-        found = json.loads((cache_folder() / RATES_FILE).read_text("utf-8"))
+        return _REMEMBERED.validate_json((cache_folder() / RATES_FILE).read_bytes())
     except (OSError, ValueError):
         return {}
-    machines = found if isinstance(found, dict) else {}
-    return {
-        name: {
-            unit: [rate for rate in rates if isinstance(rate, float) and rate > 0]
-            for unit, rates in runs.items()
-            if isinstance(rates, list)
-        }
-        for name, runs in machines.items()
-        if isinstance(runs, dict)
-    }
