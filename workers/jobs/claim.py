@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import uuid
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 from biresnerf.stages import ReusableStage
@@ -94,15 +94,8 @@ async def _claim(
 
 
 def _claimed(row: dict[str, Any], token: uuid.UUID) -> Claim:
-    same = ("dataset_id", "attempt", "kind", "parent", "fixed_from", "options", "smaller")
-    also = ("checkpoint", "reusable", "trace")
-    return Claim(
-        row["id"],
-        token=token,
-        forked_stage=row["forked_stage"],
-        title=row["labels"].get("name"),
-        **{name: row[name] for name in (*same, *also)},
-    )
+    named = {field.name: row[field.name] for field in fields(Claim) if field.name in row}
+    return Claim(**named, job_id=row["id"], token=token, title=row["labels"].get("name"))
 
 
 async def cancel_requested(database: Database, job_id: str) -> bool:
