@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import os
 import shutil
 import subprocess
 from datetime import UTC, datetime
@@ -18,6 +17,7 @@ from typing import Any
 import psycopg
 
 from biresnerf import __version__
+from biresnerf.data.model.atomic_file import whole_file, write_text
 from workers.settings.errors import NotFound, SetupError
 from workers.settings.settings import Settings
 from workers.store.files import FileStore, StoredFile, open_files
@@ -79,7 +79,7 @@ async def make_backup(settings: Settings, url: str, folder: Path) -> BackupIndex
             gone=tuple(sorted(named - saved.keys())),
         )
         await asyncio.to_thread(_dump, settings, url, folder / index.database, moment)
-    _write_whole(folder / INDEX_NAME, index.model_dump_json(indent=1).encode())
+    write_text(folder / INDEX_NAME, index.model_dump_json(indent=1))
     _prune(folder, index)
     return index
 
@@ -126,24 +126,11 @@ async def _save(store: FileStore, file: StoredFile, folder: Path, before: SavedF
     known = before is not None and (before.size, before.etag) == (file.size, file.etag)
     if before is not None and known and path.is_file() and path.stat().st_size == file.size:
         return before
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + "#partial")  # no key has such a name
-    with partial.open("wb") as out:
+    with whole_file(path) as partial, partial.open("wb") as out:
         async for chunk in store.read(file.key):
             await asyncio.to_thread(out.write, chunk)
-        os.fsync(out.fileno())
-    partial.rename(path)
     digest = await asyncio.to_thread(sha256_of, path)
     return SavedFile(key=file.key, size=path.stat().st_size, sha256=digest, etag=file.etag)
-
-
-def _write_whole(path: Path, content: bytes) -> None:
-    partial = path.with_name(path.name + ".new")
-    with partial.open("wb") as out:
-        out.write(content)
-        out.flush()
-        os.fsync(out.fileno())
-    partial.rename(path)
 
 
 def _prune(folder: Path, index: BackupIndex) -> None:
