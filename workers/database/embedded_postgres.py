@@ -38,6 +38,7 @@ log = logging.getLogger(__name__)
 SOCKET_NAME = ".s.PGSQL.5432"
 SOCKET_PATH_MAX = 107  # bytes; sockaddr_un.sun_path without its final zero
 LOG_BYTES_MAX = 10 * 2**20
+STOP_S = 30.0
 NETWORK_FILE_SYSTEMS = {"nfs", "nfs4", "cifs", "smb3", "smbfs", "9p", "fuse.sshfs", "ceph", "glusterfs"}
 SERVER_OPTIONS = {
     "listen_addresses": "",
@@ -100,15 +101,15 @@ class EmbeddedPostgres:
         """Whether the server process runs."""
         return self.process is not None and self.process.poll() is None
 
-    def stop(self, *, timeout_s: float = 30.0) -> None:
+    def stop(self) -> None:
         """Fast shutdown, then free the folder for others."""
         if self.process is not None and self.process.poll() is None:
             self.process.send_signal(signal.SIGINT)
             try:
-                self.process.wait(timeout_s)
+                self.process.wait(STOP_S)
             except subprocess.TimeoutExpired:
                 self.process.send_signal(signal.SIGQUIT)  # recovery at the next start
-                self.process.wait(timeout_s)
+                self.process.wait(STOP_S)
         if self._lock is not None:
             self._lock.close()
             self._lock = None
