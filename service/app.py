@@ -29,7 +29,6 @@ from service.http.problems import ProblemError, problem_of
 from service.http.request_context import RequestContext, render
 from service.intake.archive_import import import_upload
 from service.intake.json_body import validation_problem
-from service.intake.uploads import sweep_staging
 from service.routes import (
     artifacts,
     batches,
@@ -47,6 +46,7 @@ from service.routes import (
     webhooks,
 )
 from workers.engine import open_stores
+from workers.process.locked_folders import sweep_folders
 from workers.process.watchdog import end_if_hung
 from workers.settings.errors import Unavailable
 from workers.settings.settings import Settings
@@ -93,7 +93,7 @@ def create_app(settings: Settings) -> FastAPI:
         async with end_if_hung(), open_stores(settings) as stores:
             service = Service(settings, stores, metrics)
             app.state.service = service
-            swept = await asyncio.to_thread(sweep_staging, service.staging_dir)
+            swept = await asyncio.to_thread(sweep_folders, service.staging_dir)
             if swept:
                 logger.info("removed %d unfinished uploads", swept)
             service.keep_running(_repeat(finish_checks, service, _UNFINISHED_EVERY_S))

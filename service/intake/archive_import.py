@@ -16,8 +16,9 @@ from service.http.dependencies import Service
 from service.http.problems import ProblemError, problem_of
 from service.intake.sandboxed_child import Limits, run_confined
 from service.intake.unpack import UnpackRequest
-from service.intake.uploads import capped, staging_folder, write_stream
+from service.intake.uploads import capped, write_stream
 from workers.database.claimed_work import lease_renewed
+from workers.process.locked_folders import locked_folder
 from workers.process.waiting import retry_while_unavailable
 from workers.records import Upload
 from workers.settings.errors import EngineError, NotFound
@@ -150,7 +151,7 @@ async def _add_to_dataset(service: Service, upload: Upload) -> None:
             upload.dataset_id, upload.path, content, sha256=upload.sha256, upload_id=upload.id
         )
         return
-    async with staging_folder(service.staging_dir) as folder:
+    async with locked_folder(service.staging_dir) as folder:
         archive = folder / "archive"
         content = MeasuredStream("archive", uploads.content(upload), upload.size, upload.sha256).all_with(b"")
         await write_stream(capped(content, upload.size, budget=service.disk_budget), archive)

@@ -18,7 +18,8 @@ from service.http.problems import ProblemError, wrong_field
 from service.intake.archive_import import file_sha256, import_archive
 from service.intake.dataset_finalize import begin_check, finish_check
 from service.intake.json_body import load_json, validate
-from service.intake.uploads import limited_body, staging_folder
+from service.intake.uploads import limited_body
+from workers.process.locked_folders import locked_folder
 from workers.settings.errors import EngineError
 
 # For the text fields and the delimiters of the form; of one text field.
@@ -86,7 +87,7 @@ async def submit_form(caller: Caller, request: Request, idempotency_key: str | N
     limit = caller.service.settings.max_archive_bytes + _FORM_BYTES
     body = limited_body(request, limit, caller.service.disk_budget)
     with caller.sending():
-        async with staging_folder(caller.service.staging_dir) as folder:
+        async with locked_folder(caller.service.staging_dir) as folder:
             texts = _texts(await read_form(request.headers["content-type"], body, folder / ARCHIVE))
             return await _submit_received(caller, folder / ARCHIVE, texts, idempotency_key)
 

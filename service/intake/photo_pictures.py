@@ -16,7 +16,7 @@ from biresnerf.frozen_model import FrozenModel
 from biresnerf.wire.datasets import CheckedCamera, CheckedPhoto, PhotoList
 from service.http.access import Caller
 from service.intake.sandboxed_child import Limits, run_child, run_confined
-from service.intake.uploads import staging_folder
+from workers.process.locked_folders import locked_folder
 from workers.records import PHOTO_LIST, DatasetFile
 from workers.settings.errors import NotFound
 
@@ -55,7 +55,7 @@ class Picture:
     async def drawn(self, caller: Caller) -> bytes:
         """The picture; raises `ProblemError` (``validation_timeout``, ``validation_resources``)."""
         service = caller.service
-        async with service.decoding.turn(caller.tenant), staging_folder(service.staging_dir) as folder:
+        async with service.decoding.turn(caller.tenant), locked_folder(service.staging_dir) as folder:
             sources = [(file.key, file.path) for file in self.files]
             await service.stores.files.stage(sources, folder / _FILES)
             request = DrawRequest(folder=folder, photo=self.photo, camera=self.camera, name=self.name)

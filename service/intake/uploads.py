@@ -3,12 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import fcntl
-import shutil
-import time
-import uuid
 from collections.abc import AsyncGenerator, AsyncIterator
-from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +12,6 @@ from fastapi import Request
 from service.http.problems import ProblemError
 from workers.process.disk_space import DiskBudget
 
-_LOCK = ".in-use"
 # A client that sends nothing for this long only occupies a connection and a folder.
 IDLE_S = 60.0
 _CHECK_EVERY_BYTES = 16 * 2**20  # between two checks of the free disk space
@@ -83,41 +77,3 @@ async def write_stream(stream: AsyncIterator[bytes], target: Path) -> None:
     with target.open("xb") as out:
         async for chunk in stream:
             await asyncio.to_thread(out.write, chunk)
-
-
-@asynccontextmanager
-async def staging_folder(root: Path) -> AsyncIterator[Path]:
-    """A private folder, deleted at the end of the block or, after a crash, at the next start."""
-    folder = root / uuid.uuid4().hex
-    folder.mkdir(parents=True, mode=0o700)
-    with (folder / _LOCK).open("wb") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        try:
-            yield folder
-        finally:
-            await asyncio.to_thread(shutil.rmtree, folder, ignore_errors=True)
-
-
-def sweep_staging(root: Path) -> int:
-    """Removes staging folders of dead processes, which no longer hold the lock; returns how many."""
-    removed = 0
-    for folder in root.iterdir() if root.is_dir() else ():
-        try:
-            with (folder / _LOCK).open("rb") as lock:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            continue
-        except OSError:
-            # Without a lock file the folder is either brand new or half removed; its age shows which.
-            if _modified_within(folder, 3600):
-                continue
-        shutil.rmtree(folder, ignore_errors=True)
-        removed += 1
-    return removed
-
-
-def _modified_within(path: Path, seconds: float) -> bool:
-    try:
-        return time.time() - path.stat().st_mtime < seconds
-    except OSError:
-        return True

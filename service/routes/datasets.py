@@ -26,7 +26,8 @@ from service.http.problems import ProblemError, declared
 from service.intake.archive_import import import_archive
 from service.intake.dataset_finalize import begin_check, finish_check
 from service.intake.json_body import JSON_BYTES_MAX, JsonRoute
-from service.intake.uploads import limited_body, raw_request, staging_folder, write_stream
+from service.intake.uploads import limited_body, raw_request, write_stream
+from workers.process.locked_folders import locked_folder
 
 ENTRY_BYTES = 2048  # allowed in a manifest for each file that a dataset may have
 _DIGEST = re.compile(r"sha-256=:([A-Za-z0-9+/=]+):")
@@ -174,7 +175,7 @@ async def upload_archive(dataset_id: DatasetId, request: Request, caller: Datase
     body = limited_body(request, caller.service.settings.max_archive_bytes, caller.service.disk_budget)
     await caller.datasets.get(dataset_id)
     with caller.sending():
-        async with staging_folder(caller.service.staging_dir) as folder:
+        async with locked_folder(caller.service.staging_dir) as folder:
             await write_stream(body, folder / "archive")
             return await import_archive(caller.service, dataset_id, folder / "archive")
 

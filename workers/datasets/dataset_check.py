@@ -5,14 +5,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
-import fcntl
 import json
 import logging
-import shutil
-import tempfile
-import time
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -26,6 +22,7 @@ from workers.database.claimed_work import lease_renewed
 from workers.database.database import Connection, Database, Statement
 from workers.database.losses import LOSSES_MAX, LostTooOften, at_an_end, counted
 from workers.process.disk_space import EXIT_DISK
+from workers.process.locked_folders import locked_folder, sweep_folders
 from workers.process.memory_limits import CHECK_VARIABLE, memory_limit, memory_shares
 from workers.process.turns import Turns
 from workers.process.waiting import retry_while_unavailable
@@ -41,8 +38,6 @@ CHECK_NICE = 5  # more urgent than a job: somebody waits for it
 
 EXIT_INPUT_ERROR = 2
 CHECKS = "checks"
-IN_USE = "in-use"
-SETTLED_S = 1.0
 LOOK_S = 0.5  # between two looks at a check that another process makes
 # A check may take so long: for any set, for each file, and by their bytes.
 ANY_S, FILE_S, BYTES_PER_S = 120.0, 10.0, 100e3
@@ -93,7 +88,7 @@ class Checker:
 
     async def unfinished(self) -> tuple[str, ...]:
         """Ids of ``finalizing`` datasets that no process checks; removes folders of processes that died."""
-        await asyncio.to_thread(_sweep, self._settings.scratch_dir / CHECKS)
+        await asyncio.to_thread(sweep_folders, self._settings.scratch_dir / CHECKS)
         rows = await self._database.fetch(
             "SELECT id FROM datasets WHERE state = 'finalizing'"
             " AND coalesce(check_until < clock_timestamp(), true) ORDER BY created_at"
@@ -151,7 +146,7 @@ class Checker:
             OSError: the disk is full, which says nothing about the files.
             Unavailable: the store is away.
         """
-        with _folder(self._settings.scratch_dir / CHECKS) as folder:
+        async with locked_folder(self._settings.scratch_dir / CHECKS) as folder:
             dataset, errors = folder / "input", folder / "log.txt"
             await self._files.stage(members, dataset)
             try:
@@ -181,32 +176,6 @@ async def _record(connection: Connection, take: Take, outcome: CheckReport | Job
     )
     if ours and isinstance(outcome, CheckReport):
         await forget(connection, shown_key(take.dataset_id))
-
-
-@contextlib.contextmanager
-def _folder(parent: Path) -> Iterator[Path]:
-    """A folder that nobody sweeps away while this process lives."""
-    parent.mkdir(parents=True, exist_ok=True)
-    folder = Path(tempfile.mkdtemp(dir=parent))
-    lock = (folder / IN_USE).open("w")
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # the kernel frees it, however we die
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-        lock.close()
-
-
-def _sweep(parent: Path) -> None:
-    """Remove folders of processes that were killed."""
-    for folder in parent.iterdir() if parent.is_dir() else ():
-        with contextlib.suppress(OSError):  # in use, or gone by now
-            if time.time() - folder.stat().st_mtime < SETTLED_S:
-                continue  # perhaps made, and not locked yet
-            if (folder / IN_USE).exists():
-                with (folder / IN_USE).open() as lock:
-                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _enough_s(dataset: Path) -> float:

@@ -1,9 +1,7 @@
 from __future__ import annotations
 
 import asyncio
-import fcntl
 import itertools
-import os
 from collections.abc import AsyncGenerator, AsyncIterator
 from pathlib import Path
 
@@ -15,7 +13,7 @@ from starlette.types import Message
 
 from service.http.problems import ProblemError
 from service.intake.one_shot import read_form
-from service.intake.uploads import capped, limited_body, staging_folder, sweep_staging
+from service.intake.uploads import capped, limited_body
 
 
 async def pieces(content: bytes, cuts: list[int]) -> AsyncGenerator[bytes, None]:
@@ -116,23 +114,3 @@ def test_a_bad_form_is_a_problem(tmp_path: Path, body: bytes, code: str) -> None
     with pytest.raises(ProblemError) as caught:
         asyncio.run(read_form("multipart/form-data; boundary=b", pieces(body, []), tmp_path / "archive"))
     assert caught.value.code == code
-
-
-def test_staging_folders_go_away_with_their_use_and_after_a_crash(tmp_path: Path) -> None:
-    async def use() -> None:
-        async with staging_folder(tmp_path) as folder:
-            (folder / "archive").write_bytes(b"x")
-            os.utime(folder, (0, 0))
-            assert sweep_staging(tmp_path) == 0  # in use, however long
-
-    asyncio.run(use())
-    assert list(tmp_path.iterdir()) == []
-    crashed = tmp_path / "crashed"
-    crashed.mkdir()
-    (crashed / ".in-use").touch()  # its lock went with its process
-    living = tmp_path / "living"
-    living.mkdir()
-    with (living / ".in-use").open("wb") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        assert sweep_staging(tmp_path) == 1
-    assert [path.name for path in tmp_path.iterdir()] == ["living"]

@@ -173,7 +173,7 @@ async def test_what_a_killed_check_left_is_cleared_away_and_what_is_in_use_stays
     while not list(checks.glob("*/log.txt")):
         await asyncio.sleep(0.05)
     (checks / "left" / "input").mkdir(parents=True)
-    (checks / "left" / "in-use").touch()
+    (checks / "left" / ".in-use").touch()
     settings = quick_settings(tmp_path / "data", database_url=database_url)
     async with open_stores(settings) as stores:
         while (checks / "left").exists():
