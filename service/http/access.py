@@ -125,9 +125,9 @@ class Caller:
                 "scope_required", f"The key lacks the scope {scope}.", headers={"WWW-Authenticate": challenge}
             )
 
-    def sending(self) -> AbstractContextManager[None]:
+    def sending(self) -> AbstractContextManager[object]:
         """Counts an upload while it runs; raises ``ProblemError`` (``too_many_uploads``) at the client's limit."""
-        return self.service.sending.counted(self.client)
+        return self.service.sending.counted(self.client, 1)
 
 
 class Access:

@@ -27,77 +27,48 @@ from workers.settings.settings import Settings
 Listing = TypeVar("Listing", bound=BaseModel)
 # Bodies as they came; their values take about ten times as much, one body after the other.
 JSON_BYTES_AT_ONCE = 32 * 2**20
+JSON_FREE_BYTES = 64 * 2**10  # of each body, not counted: usual requests pass whoever sends large ones
 _ID = re.compile(r"^[a-z]{2,3}_[0-9A-Za-z]{1,40}$", re.ASCII)
 
 
-class UploadLimit:
-    """How many uploads each client may send at once, counted by each web process alone; 0 is no limit."""
+class Held:
+    """What clients hold of something at once, counted by each web process alone.
 
-    def __init__(self, limit: int) -> None:
-        self._limit = limit
-        self._running: Counter[str] = Counter()
+    Args:
+        what: it is, in the plural.
+        each: how much one client may hold; 0 is no limit.
+        in_all: how much all may hold together.
 
-    @contextmanager
-    def counted(self, client: str | None) -> Iterator[None]:
-        """Counts one upload of the client while the context lasts; without a client nothing is counted.
-
-        Raises:
-            ProblemError: ``too_many_uploads``: the limit is reached.
-        """
-        if client is None or not self._limit:
-            yield
-            return
-        if self._running[client] >= self._limit:
-            raise ProblemError(
-                "too_many_uploads",
-                f"{self._limit} uploads are under way, which is the limit.",
-                hint="Continue when one of them is done.",
-            )
-        self._running[client] += 1
-        try:
-            yield
-        finally:
-            self._running[client] -= 1
-            if not self._running[client]:
-                del self._running[client]
-
-
-class BodyLimit:
-    """How many bytes of JSON bodies one web process holds at once, in all; each client may hold half.
-
-    The first `FREE_BYTES` of each body are not counted, so that usual requests pass whoever sends large ones.
+    Who holds nothing beside it may hold one thing larger than that.
     """
 
-    FREE_BYTES = 64 * 2**10
-
-    def __init__(self, limit: int) -> None:
-        self._limit = limit
+    def __init__(self, what: str, *, each: int, in_all: int = 0) -> None:
+        self._what, self._each, self._in_all = what, each, in_all
         self._held: Counter[str | None] = Counter()
 
     @contextmanager
-    def counted(self, client: str | None) -> Iterator[Callable[[int], None]]:
-        """Counts one body while the context lasts; tell the function how many of its bytes there are.
+    def counted(self, client: str | None, amount: int = 0) -> Iterator[Callable[[int], None]]:
+        """Counts one thing while the context lasts; tell the function how much it is by now.
 
-        A body that is the only one may be larger than the limit. The function raises ``ProblemError``
-        (``too_many_uploads``).
+        Both raise ``ProblemError`` (``too_many_uploads``). Without a client only what all hold is limited.
         """
         mine = 0
 
-        def hold(size: int) -> None:
+        def hold(now: int) -> None:
             nonlocal mine
-            more = max(0, size - self.FREE_BYTES) - mine
-            share = self._limit if client is None else self._limit // 2
-            for held, limit in ((self._held.total(), self._limit), (self._held[client], share)):
-                if more and held > mine and held + more > limit:
+            more, each = now - mine, 0 if client is None else self._each
+            for held, limit in ((self._held.total(), self._in_all), (self._held[client], each)):
+                if limit and more > 0 and held > mine and held + more > limit:
                     raise ProblemError(
                         "too_many_uploads",
-                        f"The bodies under way have more than {limit} bytes, which is the limit.",
-                        hint="Continue when one of them is done.",
+                        f"At most {limit} {self._what} are taken at once.",
+                        hint="Continue when one of those under way is done.",
                     )
-            mine += more
+            mine = now
             self._held[client] += more
 
         try:
+            hold(amount)
             yield hold
         finally:
             self._held[client] -= mine
@@ -118,13 +89,15 @@ class Service:
     memory: MemoryShares = field(init=False)
     unpacking: Turns = field(init=False)
     decoding: Turns = field(init=False)
-    sending: UploadLimit = field(init=False)
-    bodies: BodyLimit = field(default_factory=lambda: BodyLimit(JSON_BYTES_AT_ONCE))
+    sending: Held = field(init=False)
+    bodies: Held = field(
+        default_factory=lambda: Held("bytes of JSON", each=JSON_BYTES_AT_ONCE // 2, in_all=JSON_BYTES_AT_ONCE)
+    )
 
     def __post_init__(self) -> None:
         self.memory = memory_shares(memory_limit(), self.settings.processes)
         self.unpacking, self.decoding = Turns(self.memory.unpacks), Turns(self.memory.pictures)
-        self.sending = UploadLimit(self.settings.key_uploads)
+        self.sending = Held("uploads", each=self.settings.key_uploads)
 
     @property
     def staging_dir(self) -> Path:

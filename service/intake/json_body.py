@@ -14,7 +14,7 @@ from pydantic import BaseModel, ValidationError
 from starlette.types import Scope
 
 from biresnerf.wire.problems import FieldProblem
-from service.http.dependencies import service_of
+from service.http.dependencies import JSON_FREE_BYTES, service_of
 from service.http.problems import ProblemError
 from service.intake.uploads import limited_body
 
@@ -69,7 +69,7 @@ async def read_json(request: Request, limit: int = JSON_BYTES_MAX) -> AsyncItera
     body = bytearray()
     with service_of(request).bodies.counted(request.state.client) as hold:
         async for chunk in limited_body(request, limit):
-            hold(len(body) + len(chunk))
+            hold(max(0, len(body) + len(chunk) - JSON_FREE_BYTES))
             body += chunk
         values = load_json(bytes(body))
         body.clear()

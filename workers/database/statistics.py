@@ -35,14 +35,14 @@ class Statistics:
     tallies: list[DictRow]
 
 
-_LIVING = """slots JOIN queue_workers AS worker ON worker.id = slots.worker_id
+LIVING = """slots JOIN queue_workers AS worker ON worker.id = slots.worker_id
     AND worker.last_heartbeat > now() - make_interval(secs => %s)"""
 _SLOTS = f"""
     SELECT slots.kind,
         EXISTS (SELECT FROM queue_entries AS entry JOIN running_jobs AS job ON job.queue_id = entry.id
             WHERE entry.worker_id = worker.id AND entry.state = 'doing' AND job.kind = 'refine') AS busy,
         count(*) AS slots
-    FROM {_LIVING} GROUP BY 1, 2"""
+    FROM {LIVING} GROUP BY 1, 2"""
 _TALLIES = """
     SELECT name, label, bucket, sum(count)::bigint AS count, sum(amount) AS amount FROM (
         SELECT name, label, bucket, count, amount FROM tallies
@@ -74,12 +74,6 @@ async def read_statistics(database: Database, stall_s: float) -> Statistics:
             bounds_s=bounds["bounds_s"],
             tallies=await connection.rows(_TALLIES),
         )
-
-
-async def living_slots(database: Database, stall_s: float) -> int:
-    """Slots whose worker sent a heartbeat within ``stall_s``; raises `Unavailable`."""
-    (row,) = await database.fetch(f"SELECT count(*) AS n FROM {_LIVING}", stall_s)
-    return int(row["n"])
 
 
 async def fold_tallies(connection: Connection) -> None:

@@ -9,7 +9,7 @@ from typing import Literal
 from biresnerf.wire.operator import FailedJob, OperatorView, PriorityCount, RunningJob, SlotView
 from workers.database.database import Database
 from workers.database.migrate import step_names
-from workers.database.statistics import Statistics, living_slots, read_statistics
+from workers.database.statistics import LIVING, Statistics, read_statistics
 from workers.records import PRIORITIES, record_from_row
 from workers.settings.errors import Unavailable
 from workers.store.files import FileStore
@@ -71,7 +71,8 @@ class Monitor:
 
     async def living_workers(self) -> int:
         """Worker slots that sent a heartbeat within the stall time; raises `Unavailable`."""
-        return await living_slots(self._database, self._stall_s)
+        (row,) = await self._database.fetch(f"SELECT count(*) AS n FROM {LIVING}", self._stall_s)
+        return int(row["n"])
 
     async def lacking(self) -> dict[Need, str]:
         """What is not as it has to be, and why; empty where jobs can be taken. Answers within seconds."""
