@@ -22,7 +22,12 @@ def shown_pictures():
 
 def test_a_command_makes_each_picture_and_a_page_shows_it():
     drawn = {path for path in GENERATED if path.parent == FOLDER}
-    made = drawn | {refined_scene.BEFORE_AFTER, *result_pictures.PICTURES, *screenshots.SCREENSHOTS.values()}
+    made = drawn | {
+        refined_scene.BEFORE_AFTER,
+        refined_scene.FLIGHT,
+        *result_pictures.PICTURES,
+        *screenshots.SCREENSHOTS.values(),
+    }
     made.add(moving_cameras.CAMERAS)
     assert {path for path in FOLDER.iterdir() if path.is_file()} == made
     assert made == {path for _, path in shown_pictures() if path.parent == FOLDER}

@@ -109,8 +109,8 @@ def test_a_line_of_stage_1_says_what_the_detector_saw(result):
     lines = (result.folder / "history.jsonl").read_text().splitlines()
     coarse = [line for line in lines if '"coarse"' in line]
     assert coarse
-    assert all("still_deg" in line for line in coarse)
-    assert all("still_deg" not in line for line in lines if line not in coarse)
+    assert all("confirmed" in line for line in coarse)
+    assert all("confirmed" not in line for line in lines if line not in coarse)
 
 
 def copy_of(folder, tmp_path):

@@ -34,9 +34,6 @@ class HistoryLine(FrozenModel):
     field_rate: float
     reconstruction_rate: float
     seconds: float
-    still_deg: float | None = Field(
-        None, description="Stage 1: cameras that rotated by less count as settled, degrees."
-    )
     trend_db: float | None = Field(
         None, description="Stage 1: what the later half of its checks gained; from the sixth check on."
     )

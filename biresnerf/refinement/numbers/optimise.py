@@ -57,12 +57,8 @@ class ErrorNumbers:
 
 @dataclass(frozen=True)
 class SwitchNumbers:
-    """When the error is level and cameras are still: stage 2 begins."""
+    """When the error is level: stage 2 begins."""
 
     least_checks: int = 6  # before anything is said: three in the later half make a line with a deviation
     level_share: float = 0.15  # of all that was gained: what the later half may bring, or scatter by
     confirmations: int = 2  # checks in a row
-    still_deg: float = 0.05  # 90 % quantile of rotation change per block below which cameras have settled
-    # Adam's steps have the size of the learning rate whatever the gradient: settled cameras still stagger by about
-    # rate * sqrt(steps) in a block. Measured on settled rigs: 1.2 to 1.5 times that; while they move, 3 and more.
-    stagger: float = 1.7

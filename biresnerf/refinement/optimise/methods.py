@@ -44,7 +44,6 @@ class Method:
         occupancy_side: cells a side of the occupancy grid, given the options.
         two_stages: whether there is a switch; a run without one is in its last stage from the first step.
         pose_betas: of the poses' Adam.
-        guard: stage 2 begins only when cameras are still.
         mobility: cameras placed by matches keep still in stage 1.
         short_stage_1: stage 1 is shorter where matches placed most cameras.
         near_plane: nothing is sampled nearer than where other cameras look too.
@@ -72,7 +71,6 @@ class Method:
     occupancy_side: Callable[[ResolvedOptions], int]
     two_stages: bool = False
     pose_betas: tuple[float, float] = (0.9, 0.999)
-    guard: bool = False
     mobility: bool = False
     short_stage_1: bool = False
     near_plane: bool = False
@@ -147,7 +145,6 @@ BIRESNERF = Method(
     _affordable_occupancy,
     two_stages=True,
     pose_betas=(0.9, 0.99),
-    guard=True,
     mobility=True,
     short_stage_1=True,
     near_plane=True,

@@ -32,12 +32,10 @@ class StabilityDetector:
 
     Attributes:
         floor, cap: no switch before step `floor`; always at step `cap`.
-        guarded: whether moving cameras put the switch off, which is not in the paper.
     """
 
     floor: int
     cap: int
-    guarded: bool = True
     numbers: SwitchNumbers = SwitchNumbers()
     decibels: list[float] = field(default_factory=list)
     confirmed: int = 0
@@ -46,17 +44,10 @@ class StabilityDetector:
         """No switch before step `floor`; always at step `cap`."""
         self.floor, self.cap = floor, cap
 
-    def still_deg(self, pose_rate: float, steps: int) -> float:
-        """Rotation within a block of `steps` steps that settled cameras may show at this learning rate (rad)."""
-        return max(self.numbers.still_deg, self.numbers.stagger * math.degrees(pose_rate) * math.sqrt(steps))
-
-    def check(
-        self, step: int, mean_squared_error: float, moved_deg: float, still_deg: float | None = None
-    ) -> Verdict:
-        """One block's result at `step`. `moved_deg`: 90 % quantile of the cameras' rotation during the block."""
+    def check(self, step: int, mean_squared_error: float) -> Verdict:
+        """One block's result at `step`."""
         self.decibels.append(-10 * math.log10(max(mean_squared_error, 1e-12)))
-        still = moved_deg < (still_deg or self.numbers.still_deg) or not self.guarded
-        self.confirmed = self.confirmed + 1 if still and self._level() else 0
+        self.confirmed = self.confirmed + 1 if self._level() else 0
         if step >= self.cap:
             return "cap"
         return "stable" if self.confirmed >= self.numbers.confirmations and step >= self.floor else "running"

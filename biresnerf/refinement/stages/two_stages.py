@@ -78,8 +78,7 @@ class TwoStages:
     ) -> None:
         self.optimiser, self.repair, self.run = optimiser, repair, run
         self._at_check, self._write_preview = at_check, write_preview
-        method = optimiser.method
-        self.detector = StabilityDetector(0, 0, method.guard, method.switch)
+        self.detector = StabilityDetector(0, 0, optimiser.method.switch)
         self._take_lengths()
         self._previews = PreviewTimer(optimiser.options.checkpoint_every_s)
         self._reported = self._saved = 0.0
@@ -180,9 +179,8 @@ class TwoStages:
             self._repair_if_due()
             self.replan()
             return
-        still_deg = self.detector.still_deg(optimiser.pose_rate(), optimiser.options.check_every)
-        verdict = self.detector.check(optimiser.step_index, error, self._moved_deg, still_deg)
-        self._signal = {"still_deg": still_deg, **self.detector.signal()}
+        verdict = self.detector.check(optimiser.step_index, error)
+        self._signal = self.detector.signal()
         self._write_history(error, last)
         self._repair_if_due(switching=verdict != "running")
         if verdict != "running":

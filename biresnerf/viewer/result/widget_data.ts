@@ -10,7 +10,7 @@ export type UrlOf = (file: string) => string | null;
 /** The part of a history line that the curves show. */
 export type CurvePoint = Pick<
   HistoryLine,
-  "step" | "stage" | "psnr" | "loss" | "moved_deg" | "still_deg" | "trend_db" | "level_db"
+  "step" | "stage" | "psnr" | "loss" | "moved_deg" | "trend_db" | "level_db"
 >;
 
 export interface SceneCamera {

@@ -54,14 +54,13 @@ const CHARTS: readonly Chart[] = [
     logarithmic: true,
     curves: [
       { label: "rotation, ° (90 % quantile)", colour: "--curve-1", value: (line) => positive(line.moved_deg) },
-      { label: "settled below", colour: "--curve-3", value: (line) => line.still_deg, dashed: true },
     ],
     summary: (lines) => ends(lines, "Turning between checks", (line) => `${short(line.moved_deg)} degrees`),
   },
   {
     title: "Stability signal",
     axis: "dB, later half of the steps",
-    of: (line) => line.still_deg != null,
+    of: (line) => line.stage === "coarse",
     later: "begins at the detector's sixth check",
     curves: [
       { label: "trend of the error, dB", colour: "--curve-1", value: (line) => line.trend_db },

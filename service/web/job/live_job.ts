@@ -183,7 +183,7 @@ export class LiveJob extends Store<LiveState> {
   }
 }
 
-const SIGNAL = ["still_deg", "trend_db", "level_db"] as const;
+const SIGNAL = ["trend_db", "level_db"] as const;
 
 const stepping = ({ stage }: JobView) => (stage === "coarse" || stage === "fine" ? stage : null);
 

@@ -22,8 +22,6 @@ from biresnerf.refinement.optimise.method_changes import changed, differences
 from biresnerf.refinement.optimise.methods import BIRESNERF, Method, find_method
 from biresnerf.stages import CHECKPOINT
 from tests.refinement.tiny_scene import (
-    TinyRun,
-    given_scene,
     tiny_optimiser,
     tiny_options,
     tiny_recipe,
@@ -32,7 +30,7 @@ from tests.refinement.tiny_scene import (
 )
 
 PARTS = (
-    "guard", "mobility", "short_stage_1", "near_plane", "weights", "repair", "adjustment", "uncertainty",
+    "mobility", "short_stage_1", "near_plane", "weights", "repair", "adjustment", "uncertainty",
 )  # fmt: skip
 QUICK = {"steps": 20, "coarse_steps_min": 10, "coarse_steps_max": 10, "max_image_size": 16, "verdict": False}
 MINE = """
@@ -167,18 +165,6 @@ def test_each_part_of_ours_can_be_left_out_alone_and_published_methods_have_none
     for part in PARTS:
         assert differences(tiny_recipe(changed(BIRESNERF, {part: False}))) == {part: "False"}
         assert not getattr(find_method("biresnerf-paper"), part)
-
-
-def test_without_the_guard_moving_cameras_do_not_put_the_switch_off(tmp_path):
-    dataset, images = tiny_set(tmp_path)
-    for guarded in (True, False):
-        method = replace(BIRESNERF, guard=guarded)
-        run = TinyRun(
-            tiny_optimiser(dataset, images, tiny_options(), method=method),
-            given_scene(dataset, images),
-            tmp_path,
-        )
-        assert run.stages.detector.guarded is guarded
 
 
 def test_without_a_near_plane_open_scenes_are_sampled_from_the_schedules_own_distance(tmp_path):

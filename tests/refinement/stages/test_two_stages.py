@@ -81,14 +81,12 @@ def test_progress_carries_what_the_detector_saw_last_and_in_stage_2_nothing_of_i
     assert not finished(start(scene, tmp_path, tiny_options(), 13, told))
     line = read_history(tmp_path / HISTORY)[-1]
     assert line["step"] == 10
-    assert {name: told[-1].metrics[name] for name in ("still_deg", "confirmed")} == {
-        name: line[name] for name in ("still_deg", "confirmed")
-    }
+    assert told[-1].metrics["confirmed"] == line["confirmed"]
     resumed = start(scene, tmp_path, tiny_options(), told=told)
     resumed.stages.restore(load_checkpoint(tmp_path))
     assert finished(resumed)
     assert told[-1].stage == "fine"
-    assert "still_deg" not in told[-1].metrics
+    assert "confirmed" not in told[-1].metrics
 
 
 def test_a_stable_error_begins_stage_2_before_the_cap(scene, tmp_path):
@@ -97,8 +95,8 @@ def test_a_stable_error_begins_stage_2_before_the_cap(scene, tmp_path):
     run.stages.detector.decibels = [8.0] + [20.0] * 19
     check = run.stages.detector.check
 
-    def flat(step: int, *_):
-        return check(step, 0.01, 0.0)
+    def flat(step: int, _):
+        return check(step, 0.01)
 
     run.stages.detector.check = flat
     finished(run)
