@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from contextlib import ExitStack
 from types import TracebackType
 
@@ -11,7 +12,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from biresnerf.progress import Progress
 
-LINE_EVERY = 20  # reports of progress between two lines where there is no bar
+LINE_EVERY_S = 10.0  # between two lines where there is no bar
 BAR = "{desc} {percentage:3.0f} %|{bar}| {elapsed}{postfix}"
 
 
@@ -21,7 +22,7 @@ class ShownProgress:
     def __init__(self) -> None:
         self._bar: tqdm[None] | None = None
         self._open = ExitStack()
-        self._count, self._stage, self._message = 0, "", ""
+        self._printed_at, self._stage, self._message = -LINE_EVERY_S, "", ""
 
     def __enter__(self) -> ShownProgress:
         if sys.stderr.isatty() or "ipykernel" in sys.modules:
@@ -36,7 +37,6 @@ class ShownProgress:
 
     def __call__(self, progress: Progress) -> None:
         detail = in_words(progress)
-        self._count += 1
         news = progress.stage == "preparing" and progress.message not in {"", self._message}
         if self._bar is not None:
             self._bar.n = progress.fraction
@@ -44,7 +44,8 @@ class ShownProgress:
             self._bar.set_postfix_str(detail)
             if news:
                 self._bar.write(progress.message, sys.stderr)
-        elif news or progress.stage != self._stage or self._count % LINE_EVERY == 0:
+        elif news or progress.stage != self._stage or time.monotonic() - self._printed_at >= LINE_EVERY_S:
+            self._printed_at = time.monotonic()
             sys.stderr.write(f"{progress.stage:<10} {100 * progress.fraction:3.0f} % {detail}\n")
         self._stage, self._message = progress.stage, progress.message
 

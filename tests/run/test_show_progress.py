@@ -11,7 +11,8 @@ import pytest
 
 from biresnerf.forecast.run_forecast import RATES, Forecast
 from biresnerf.progress import Monitor, Progress
-from biresnerf.run.show_progress import LINE_EVERY, ShownProgress, in_words
+from biresnerf.run import show_progress
+from biresnerf.run.show_progress import ShownProgress, in_words
 
 
 class Terminal(io.StringIO):
@@ -56,12 +57,18 @@ def test_a_terminal_has_one_bar_with_the_time_left_and_news_above_it(monkeypatch
 
 
 def test_a_file_has_lines_without_control_characters(monkeypatch):
-    said = shown(monkeypatch, io.StringIO(), 2 * LINE_EVERY)
+    monkeypatch.setattr(show_progress, "LINE_EVERY_S", 3600.0)
+    said = shown(monkeypatch, io.StringIO(), 40)
     lines = said.splitlines()
     assert lines[0] == "preparing    0 % resuming at step 3"
     assert lines[1].startswith("coarse ")
     assert "\r" not in said
-    assert len(lines) == 4  # of 41 reports
+    assert len(lines) == 2  # of 41 reports within the hour
+
+
+def test_a_file_has_a_line_every_few_seconds(monkeypatch):
+    monkeypatch.setattr(show_progress, "LINE_EVERY_S", 0.0)
+    assert len(shown(monkeypatch, io.StringIO(), 40).splitlines()) == 41
 
 
 @pytest.mark.parametrize(

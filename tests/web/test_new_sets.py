@@ -42,7 +42,7 @@ def test_an_archive_that_cannot_be_taken_says_why_and_another_takes_its_place(
 def test_a_sample_set_is_one_click_away(page: Page, service: Running) -> None:
     page.goto(service.url)
     page.get_by_role("button", name="Try a sample set").click()
-    expect(check_row(page, "Images")).to_contain_text("24 images")
+    expect(check_row(page, "Images")).to_contain_text("32 images")
     times = page.locator(".preset-time")
     expect(times).to_have_count(4)
     expect(times.first).to_have_text(re.compile(r"about \d+( s)?( to \d+)? (s|min|h)"))
@@ -50,7 +50,7 @@ def test_a_sample_set_is_one_click_away(page: Page, service: Running) -> None:
     # It waits in the list, with its first photo, until its job is started.
     page.goto(service.url)
     waiting = page.get_by_role("region", name="Not started yet").locator(".set-card", has_text="sample")
-    expect(waiting).to_contain_text("24 photos · ready to start")
+    expect(waiting).to_contain_text("32 photos · ready to start")
     page.wait_for_function("() => document.querySelector('.set-card img')?.naturalWidth > 0")
     waiting.get_by_role("button", name="Delete sample").click()
     expect(waiting).to_have_count(0)

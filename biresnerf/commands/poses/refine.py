@@ -111,7 +111,7 @@ def summary(report: Report, output: Path) -> str:
         )
         if report.heldout.unshared_opacity is not None:
             lines.append(
-                f"{100 * report.heldout.unshared_opacity:.1f} % of it lies where no second camera looks"
+                f"{100 * report.heldout.unshared_opacity:.1f} % of that render lies where no second camera looks"
             )
     lines += [f"warning: {warning}" for warning in report.warnings]
     lines.append(f"time: {sum(report.seconds.values()):.0f} s; results in {output}")

@@ -60,6 +60,9 @@ function sorted(rows: readonly ImageRow[], by: Column, down: boolean): ImageRow[
   });
 }
 
+/** A bar of this length fills its cell at least: beside smaller turns none would mean anything. */
+const LEAST_BAR_DEG = 0.1;
+
 export function ImageTable({ rows, selected, onSelect, cellOf, ticked, onTick }: ImageTableProps) {
   const [order, setOrder] = useState<{ key: string; down: boolean } | null>(null);
   const [text, setText] = useState("");
@@ -68,7 +71,7 @@ export function ImageTable({ rows, selected, onSelect, cellOf, ticked, onTick }:
   const columns = useMemo(() => COLUMNS.filter((column) => 2 * rows.filter((row) => column.value(row) !== null).length >= rows.length), [rows]);
   const kinds = useMemo(() => [...new Set(rows.flatMap((row) => row.flags))].sort(), [rows]);
   const sources = useMemo(() => [...new Set(rows.map((row) => row.source))].sort(), [rows]);
-  const most = useMemo(() => Math.max(1e-9, ...rows.map((row) => row.moved_deg)), [rows]);
+  const most = useMemo(() => Math.max(LEAST_BAR_DEG, ...rows.map((row) => row.moved_deg)), [rows]);
   const found = useMemo(() => {
     const wanted = text.toLocaleLowerCase();
     const kept = rows.filter(

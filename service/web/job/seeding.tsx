@@ -16,7 +16,8 @@ export function Seeding({ seeding, urlOf }: { seeding: SeedingPreview; urlOf: Ur
     <div class="seeding">
       {photos && <img class="seeding-photos" src={photos} alt="Photos of the set, side by side" />}
       <p>
-        Features of {searched.length} of {count(images.length, "photo")} found; {count(matched_pairs, "pair")} of photos match.
+        Features of {searched.length} of {count(images.length, "photo")} found
+        {matched_pairs > 0 || searched.length === images.length ? `; ${count(matched_pairs, "pair")} of photos match.` : "."}
       </p>
       {matched_pairs > 0 && <Overlap images={images} />}
       {matched_pairs > 0 && lone.length > 0 && (
