@@ -43,6 +43,7 @@ FIRST_PAGES = ("[README.md]", "[docs/quick-start.md]")  # whose commands every n
 EXPECTED_SKIPS = (
     r"torch finds none",
     r"set BIRESNERF_TEST_PYCOLMAPS",
+    r"set BIRESNERF_TEST_INSTALL",
     r"set BIRESNERF_TEST_DATA to the folder that holds it",
     r"other programs' readers are run by make consumers-check",
     r"no source of .*: set BIRESNERF_CONSUMER_SOURCES",

@@ -280,7 +280,7 @@ def test_a_fork_goes_on_after_stage_1_and_its_end_on_request_leaves_a_partial_re
     dialog = again(page, job_url)
     dialog.get_by_text("More options").click()
     dialog.get_by_label("Steps of the verdict", exact=True).fill("100000")  # it would take hours
-    dialog.get_by_role("button", name="Fork: continue").click()
+    dialog.get_by_role("button", name="Continue from").click()
     fork = another_job(page, job_url)
     made = api.get(f"/jobs/{fork}").json()
     assert (made["forked_from"], made["forked_stage"]) == (done["id"], "coarse")

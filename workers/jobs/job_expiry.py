@@ -77,6 +77,16 @@ async def expire_jobs(connection: Connection, limit: int) -> int:
     return len(due)
 
 
+async def drop_left_checkpoints(connection: Connection, stall_s: float) -> None:
+    """Ended jobs need no checkpoint; versions before 007 left it in their rows, and sometimes its files."""
+    left = await connection.rows(
+        "UPDATE jobs SET checkpoint = NULL WHERE checkpoint IS NOT NULL AND state NOT IN ('queued', 'running')"
+        " RETURNING id"
+    )
+    for job in left:
+        await discard(connection, f"jobs/{job['id']}/checkpoints", after_s=2 * stall_s)
+
+
 async def forget_keys(connection: Connection, kept_s: float) -> None:
     """Idempotency keys of jobs and batches that ended so long ago can be used again."""
     for sql in ("UPDATE jobs SET idempotency_key = NULL", "UPDATE batches SET idempotency_key = NULL"):

@@ -16,6 +16,7 @@ from workers.database import job_queue
 from workers.database.database import Connection, Database
 from workers.database.statistics import fold_tallies, fold_use
 from workers.jobs.deadlines import end_overdue_jobs
+from workers.jobs.job_expiry import drop_left_checkpoints
 from workers.jobs.job_states import offer_held_jobs, requeue_lost, take_back
 from workers.settings.errors import Unavailable
 from workers.settings.settings import Settings
@@ -80,6 +81,7 @@ class Janitor:
             self._upkeep_at = time.monotonic() + UPKEEP_S
             await self._database.run(job_queue.delete_old_entries)
             await self._database.run(fold_use)
+            await self._database.run(partial(drop_left_checkpoints, stall_s=self._settings.stall_s))
 
     def _note_pause(self, now_s: float) -> None:
         """After a machine slept or a database froze all workers were silent, though all live.

@@ -71,7 +71,7 @@ def test_photos_in_a_folder_beside_that_of_a_transforms_file_are_found(tmp_path,
     dataset = read_dataset(tmp_path if whole else file)
     assert dataset.root == tmp_path
     assert {frame.path.parent for frame in dataset.frames} == {tmp_path / "photos/images"}
-    assert next(name for name, _ in look_at(file).files) == "nerfstudio/transforms.json"
+    assert next(name for name, _ in look_at(file)) == "nerfstudio/transforms.json"
 
 
 def test_photos_of_other_parts_of_a_set_and_those_without_an_entry_are_said(tmp_path):

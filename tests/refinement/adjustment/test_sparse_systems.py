@@ -74,7 +74,8 @@ def in_both_ways(fronts, evidence, start, prior):
     return found
 
 
-def assert_same(one, many, tolerance=1e-6):
+def assert_same(one, many, tolerance=1e-5):
+    # Of nearly dependent unknowns, the order of sums, which depends on the machine's threads, changes 1e-6.
     (dense, certain), (sparse, found) = one, many
     np.testing.assert_allclose(sparse.world_from_cam, dense.world_from_cam, atol=1e-8)
     assert sparse.track_noise_px == pytest.approx(dense.track_noise_px, rel=1e-8, nan_ok=True)

@@ -36,7 +36,7 @@ async def forget(self, conn):
 
 AsyncConnectionPool.putconn = forget
 database.LOOK_S, database.LOOKS = 0.1, 5
-sys.exit({"dispatcher": dispatcher, "slot": slot}[sys.argv.pop(1)].main())
+sys.exit(dispatcher.main() if sys.argv.pop(1) == "dispatcher" else slot.run_slot("a"))
 """
 
 

@@ -89,7 +89,7 @@ def test_a_csv_has_accuracies_and_check_points_and_points_that_few_photos_show_a
     assert points.check.tolist() == [False, False, True, False]
     assert points.accuracy_m[0].tolist() == [0.02, 0.02, 0.05]
     assert points.epsg == 25833
-    assert "gcp.csv" in [name for name, _ in look_at(dataset.root).files]
+    assert "gcp.csv" in [name for name, _ in look_at(dataset.root)]
     (note,) = [note for note in read_dataset(dataset.root).warnings if "gcp.csv" in note]
     assert "3 control points and 1 check points in 3 photos" in note
 

@@ -148,7 +148,7 @@ def test_what_positions_do_not_tell_is_not_claimed_and_no_file_is_written(tmp_pa
 def test_a_bad_table_is_refused_when_the_set_is_read_and_a_good_one_is_sent_with_it(tmp_path):
     (tmp_path / "gps.csv").write_text("name,lat,lon,alt\n000.jpg,1,2,3\n")
     photos(tmp_path)
-    assert "gps.csv" in [name for name, _ in look_at(tmp_path).files]
+    assert "gps.csv" in [name for name, _ in look_at(tmp_path)]
     (tmp_path / "gps.csv").write_text("name,lat,lon,alt\n000.jpg,1000,2,3\n")
     with pytest.raises(InputError, match="latitude 1000"):
         read_dataset(tmp_path)
