@@ -121,8 +121,9 @@ slurm-check: setup  ## workers for what waits on a real Slurm of one node; loses
 consumers-check: setup $(CONSUMERS)/.installed  ## what other programs' own readers make of what is written; their environment is some 4 GB
 	BIRESNERF_CONSUMERS=$(abspath $(CONSUMERS)) $(BIN)/python -m pytest -n 0 tests/consumers $(PYTEST)
 
-release: $(TOOLS)  ## wheel and source distribution in build/release, checked, and tried alone; PYTHONS="python3.11 python3.12" chooses
+release: $(TOOLS) setup  ## wheel and source distribution in build/release, checked, and tried alone, as README's lines are; PYTHONS="python3.11 python3.12" chooses
 	$(TOOLS)/bin/python .ci/release.py $(PYTHONS)
+	BIRESNERF_TEST_INSTALL=1 $(BIN)/python -m pytest -q -n 0 tests/docs/test_readers_environment.py
 
 # nerfstudio pins old versions of libraries that its parsers work without, and bpy an old NumPy.
 $(CONSUMERS)/.installed: tests/consumers/requirements.txt

@@ -42,8 +42,8 @@ const COLUMNS: readonly Column[] = [
   { key: "psnr_before", title: "PSNR before", hint: "dB, in the verdict's training on the input's poses", value: (r) => r.psnr_before, text: (r) => fixed(r.psnr_before, 2) },
   { key: "psnr_after", title: "PSNR after", hint: "dB, in the verdict's training on the refined poses", value: (r) => r.psnr_after, text: (r) => fixed(r.psnr_after, 2) },
   { key: "gain", title: "gain dB", hint: "PSNR after minus before", value: gain, text: (r) => signed(gain(r), 2) },
-  { key: "epipolar_px_before", title: "epi before", hint: "Median epipolar error of feature matches with the input's poses, px", value: (r) => r.epipolar_px_before, text: (r) => short(r.epipolar_px_before) },
-  { key: "epipolar_px_after", title: "epi after", hint: "The same with the refined poses, px", value: (r) => r.epipolar_px_after, text: (r) => short(r.epipolar_px_after) },
+  { key: "epipolar_px_before", title: "match px before", hint: "Median epipolar error of feature matches with the input's poses, px", value: (r) => r.epipolar_px_before, text: (r) => short(r.epipolar_px_before) },
+  { key: "epipolar_px_after", title: "match px after", hint: "The same with the refined poses, px", value: (r) => r.epipolar_px_after, text: (r) => short(r.epipolar_px_after) },
   { key: "psnr", title: "PSNR end", hint: "Render against photo at the end, dB; held-out views only", value: (r) => r.psnr, text: (r) => fixed(r.psnr, 2) },
 ];
 const NAME: Column = { key: "name", title: "image", hint: "", value: (r) => r.name, text: (r) => r.name };

@@ -86,7 +86,7 @@ function RunAgain({ job }: { job: JobView }) {
       request={request}
       choices={[
         { label: "Run from the start", tone: "primary", run: restart },
-        { label: "Fork: continue from this job's work", run: fork },
+        { label: "Continue from this job's work", run: fork },
       ]}
       dismiss="Close"
     >
@@ -101,8 +101,8 @@ function RunAgain({ job }: { job: JobView }) {
             withPresets
           />
           <p class="soft">
-            A fork reuses COLMAP's result or all of stage 1, as far as the changed options allow; if they allow neither, the
-            service says why.
+            Continuing saves time: it reuses COLMAP's result, or the poses of the first stage as well, as far as the changed
+            options allow. If they allow neither, you are told why.
           </p>
         </>
       )}

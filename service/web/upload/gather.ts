@@ -53,6 +53,12 @@ async function walk(entry: FileSystemEntry, below: string, found: Chosen[]): Pro
   }
 }
 
+/** Of files in no folder of their own, by which the set is found again in a list. */
+function nameOf([first, ...others]: Chosen[]): string {
+  const name = first?.file.name.replace(/\.\w+$/, "") ?? "";
+  return others.length ? `${name} and ${others.length} more` : name;
+}
+
 /** Without files of the operating system, and without a folder around everything. */
 function tidy(chosen: Chosen[]): Gathered {
   const kept = chosen.filter(({ path }) => !LEFT_OUT.test(path));
@@ -61,6 +67,6 @@ function tidy(chosen: Chosen[]): Gathered {
   const top = kept[0]?.path.split("/")[0];
   const wraps = kept.every(({ path }) => path.includes("/") && path.split("/")[0] === top);
   // These names have a meaning to the readers.
-  if (!wraps || !top || ["images", "sparse", "colmap"].includes(top)) return { name: "dataset", files: kept };
+  if (!wraps || !top || ["images", "sparse", "colmap"].includes(top)) return { name: nameOf(kept), files: kept };
   return { name: top, files: kept.map(({ path, file }) => ({ path: path.slice(top.length + 1), file })) };
 }
