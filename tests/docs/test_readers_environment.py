@@ -7,7 +7,6 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -18,7 +17,9 @@ from tests.service.free_port import free_port
 WANTED = "BIRESNERF_TEST_INSTALL"
 pytestmark = [
     pytest.mark.nightly,
-    pytest.mark.skipif(WANTED not in os.environ, reason=f"set {WANTED}, as make release does: it installs anew"),
+    pytest.mark.skipif(
+        WANTED not in os.environ, reason=f"set {WANTED}, as make release does: it installs anew"
+    ),
 ]
 PAGES = ("docs/quick-start.md", "README.md")
 # What the second page says again, or in further ways.
