@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -17,6 +19,7 @@ from tests.service.free_port import free_port
 WANTED = "BIRESNERF_TEST_INSTALL"
 pytestmark = [
     pytest.mark.nightly,
+    pytest.mark.timeout(3600),
     pytest.mark.skipif(
         WANTED not in os.environ, reason=f"set {WANTED}, as make release does: it installs anew"
     ),
@@ -24,11 +27,15 @@ pytestmark = [
 PAGES = ("docs/quick-start.md", "README.md")
 # What the second page says again, or in further ways.
 SAID_BEFORE = ("git clone ", "python3 -m venv ", "pip install ", "make ")
+# How this machine reaches what is installed; npm's file is in the home folder.
+REGISTRIES, NPM = ("pip_", "ssl_", "npm_", "node_", "http_", "https_", "no_proxy"), ".npmrc"
 # A set of the reader's own.
 PHOTOS = "biresnerf make-scene photos --views 8 --size 48 --noise 0.05 --seed 2"
 
 
 def test_a_reader_gets_what_the_pages_say_by_their_lines_alone(tmp_path):
+    if (Path.home() / NPM).is_file():
+        shutil.copyfile(Path.home() / NPM, tmp_path / NPM)
     with short_folder() as data:
         environment = {
             # The Python that runs the tests, and what every system has.
@@ -38,7 +45,7 @@ def test_a_reader_gets_what_the_pages_say_by_their_lines_alone(tmp_path):
             "BIRESNERF_DATA_DIR": str(data / "data"),
             "BIRESNERF_PORT": (port := str(free_port())),
             "BIRESNERF_URL": f"http://127.0.0.1:{port}",
-            **{name: value for name, value in os.environ.items() if name.startswith(("PIP_", "SSL_"))},
+            **{name: value for name, value in os.environ.items() if name.lower().startswith(REGISTRIES)},
         }
         script = "\n".join(("trap 'kill $(jobs -p) 2>/dev/null; wait' EXIT", *lines_of_pages()))
         done = subprocess.run(
