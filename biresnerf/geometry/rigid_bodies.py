@@ -37,8 +37,9 @@ class RigidBodies:
     @property
     def shared(self) -> list[NDArray[np.int64]]:
         """The cameras of each body that has several."""
-        groups = [np.flatnonzero(self.of == body) for body in range(int(self.of.max(initial=-1)) + 1)]
-        return [group for group in groups if len(group) > 1]
+        by_body, count = np.argsort(self.of, kind="stable"), np.bincount(self.of)
+        end = np.cumsum(count)
+        return [by_body[end[body] - count[body] : end[body]] for body in np.flatnonzero(count > 1)]
 
     @property
     def alone(self) -> NDArray[np.bool_]:

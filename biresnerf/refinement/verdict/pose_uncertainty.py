@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -53,23 +55,30 @@ def pose_uncertainty(
     ]  # fmt: skip
     focus = focus_point(poses)
     distance = focus.mean_distance if focus.well_posed else rms_spread(poses[:, :3, 3])
+    known = None if found is None else _known(found, distance)
     return tuple(
         PoseUncertainty(known_from="nothing", why_unknown=why)
-        if why is not None or found is None
-        else _known(found, i, distance)
+        if why is not None or known is None
+        else known(i)
         for i, why in enumerate(reasons)
     )
 
 
-def _known(found: ExpectedErrors, image: int, distance: float) -> PoseUncertainty:
-    source: KnownFrom = "photos"
-    if found.by_tracks[image]:
-        source = "matches and photos" if found.by_patches[image] else "matches"
-    rotation, position = (float(bounds[image]) for bounds in found.bounds_90())
-    return PoseUncertainty(
-        known_from=source,
-        rotation_deg=float(np.degrees(rotation)),
-        position=position,
-        position_percent=100 * position / distance,
-        covariance=found.moments[image].tolist(),
-    )
+def _known(found: ExpectedErrors, distance: float) -> Callable[[int], PoseUncertainty]:
+    """What is known of the pose of an image, by its number."""
+    rotation, position = found.bounds_90()
+    moments = found.moments
+
+    def of(image: int) -> PoseUncertainty:
+        source: KnownFrom = "photos"
+        if found.by_tracks[image]:
+            source = "matches and photos" if found.by_patches[image] else "matches"
+        return PoseUncertainty(
+            known_from=source,
+            rotation_deg=float(np.degrees(rotation[image])),
+            position=float(position[image]),
+            position_percent=100 * float(position[image]) / distance,
+            covariance=moments[image].tolist(),
+        )
+
+    return of
