@@ -74,8 +74,11 @@ def in_both_ways(fronts, evidence, start, prior):
     return found
 
 
-def assert_same(one, many, tolerance=1e-5):
-    # Of nearly dependent unknowns, the order of sums, which depends on the machine's threads, changes 1e-6.
+# Of rigs' nearly dependent unknowns: the order of sums, which depends on the machine, changed up to 1.3e-6.
+OF_RIGS = 1e-5
+
+
+def assert_same(one, many, tolerance=1e-6):
     (dense, certain), (sparse, found) = one, many
     np.testing.assert_allclose(sparse.world_from_cam, dense.world_from_cam, atol=1e-8)
     assert sparse.track_noise_px == pytest.approx(dense.track_noise_px, rel=1e-8, nan_ok=True)
@@ -160,14 +163,14 @@ def test_freed_lenses_end_where_the_dense_system_leads(fronts, lenses):
 def test_rigs_and_fixed_cameras_end_where_the_dense_system_leads(fronts, bodies):
     given = rig("corridor", CAMERAS)
     prior = replace(given.prior, bodies=bodies)
-    assert_same(*in_both_ways(fronts, given.evidence, given.truth, prior))
+    assert_same(*in_both_ways(fronts, given.evidence, given.truth, prior), OF_RIGS)
 
 
 def test_rigs_with_freed_lenses_end_where_the_dense_system_leads(fronts):
     given = rig("corridor", CAMERAS)
     prior = replace(given.prior, bodies=BODIES["rigs"])
     evidence = replace(given.evidence, lenses=LENSES["three lenses"])
-    assert_same(*in_both_ways(fronts, evidence, given.truth, prior))
+    assert_same(*in_both_ways(fronts, evidence, given.truth, prior), OF_RIGS)
 
 
 def test_measured_positions_end_where_the_dense_system_leads(fronts):
