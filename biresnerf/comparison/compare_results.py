@@ -89,7 +89,7 @@ def _disagree(measures: Measures) -> bool:
 
 
 def _far(found: PoseDifferences) -> str:
-    """How far the photos that contradict each other are apart."""
+    """How far the poses of the contradicting photos differ, in words."""
     far = found.contradicting
     turn = sorted(row.turned_deg for row in far)[len(far) // 2]
     which = f"{len(far)} of {len(found.rows)} photos"
@@ -150,7 +150,7 @@ def _lower(name: str) -> str:
 
 
 def _others(first: Result, second: Result) -> list[ComparedFigure]:
-    """What says nothing of the poses by itself: what was done, and with which options."""
+    """Figures that say nothing about the poses by themselves: what was done, and with which options."""
     rows = [("Photos", *(str(len(side.report.images)) for side in (first, second)))]
     rows.append(("Steps", *(str(side.report.steps_done) for side in (first, second))))
     if first.report.heldout and second.report.heldout:

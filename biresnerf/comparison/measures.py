@@ -1,6 +1,6 @@
 """The measures that tell which of two results has the better poses.
 
-Each is of the poses that a result returned: where it kept the input's, the figures of these.
+Each measures the poses that a result returned, which may be the input's.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _SIDES: Mapping[Finding, Side] = {"better": "first", "worse": "second", "same": 
 
 
 class Result(NamedTuple):
-    """What `refine` writes of a result, as far as it is compared."""
+    """The parts of a result of `refine` that are compared."""
 
     report: Report
     poses: PosesDocument
@@ -53,14 +53,14 @@ class Result(NamedTuple):
         return {image.name: image for image in self.report.images}
 
     def long_sides(self) -> dict[str, int]:
-        """Of each photo, px at full size."""
+        """The long side of each photo, px at full size."""
         cameras = self.poses.cameras
         return {i.name: max(cameras[i.camera].width, cameras[i.camera].height) for i in self.poses.images}
 
 
 @dataclass(frozen=True)
 class Measures:
-    """All four. A measure is None where neither result has it; it has no side where they have no common one."""
+    """All four. A measure is None where neither result has it; it favours neither where they share no data for it."""
 
     matches: ComparedFigure | None
     views: ComparedFigure | None
@@ -69,7 +69,7 @@ class Measures:
 
     @property
     def known(self) -> tuple[ComparedFigure, ...]:
-        """The weightiest first."""
+        """The measures that exist, the weightiest first."""
         return tuple(m for m in (self.matches, self.views, self.confirmed, self.exact) if m is not None)
 
 
@@ -219,7 +219,7 @@ def _text(values: Array, unit: str) -> str:
 
 
 def _without(name: str, texts: list[str], note: str) -> ComparedFigure | None:
-    """A measure that says nothing of the two; None where neither result has it."""
+    """A measure that does not decide between the two; None where neither result has it."""
     if texts == [NONE, NONE]:
         return None
     return ComparedFigure(name=name, first=texts[0], second=texts[1], note=note)

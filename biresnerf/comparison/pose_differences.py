@@ -22,13 +22,13 @@ EQUAL_DEG, EQUAL_SHARE = 1e-4, 1e-6  # what rounding leaves of equal poses; of t
 
 @dataclass(frozen=True)
 class PoseDifferences:
-    """Of the photos that both results hold, by name.
+    """The pose differences of the photos that both results hold.
 
     Attributes:
         rows: in the order of the first result.
         equal: whether all poses are the same but for rounding.
-        bounds: by how many times what both state of a pose's accuracy it differs, the median photo; None if most
-            photos have no stated accuracy.
+        bounds: the median photo's pose difference, in multiples of the accuracy that both state; None if most photos
+            have no stated accuracy.
         stated_deg: that accuracy as a rotation, the median photo; None if most have none.
     """
 
@@ -39,12 +39,12 @@ class PoseDifferences:
 
     @property
     def contradicting(self) -> tuple[PoseDifference, ...]:
-        """The photos of which the results cannot both be right."""
+        """The photos for which the results cannot both be right."""
         return tuple(row for row in self.rows if row.contradicts)
 
     @property
     def median_deg(self) -> float:
-        """The turn between the poses of the median photo."""
+        """The rotation between the two poses of the median photo."""
         return float(np.median([row.turned_deg for row in self.rows]))
 
 
@@ -90,7 +90,7 @@ def _matrices(images: list[PoseImage]) -> Array:
 def _joint(
     one: PoseUncertainty | None, other: PoseUncertainty | None, first_per_second: float
 ) -> tuple[float, float | None] | None:
-    """Bounds on the difference of two poses, degrees and units of the first: errors of both, as independent ones."""
+    """Bounds on the difference of two poses, degrees and units of the first: errors of both, taken as independent."""
     if one is None or other is None or one.rotation_deg is None or other.rotation_deg is None:
         return None
     turn = float(np.hypot(one.rotation_deg, other.rotation_deg))

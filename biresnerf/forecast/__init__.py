@@ -1,1 +1,1 @@
-"""How long a run takes: what is left of it, and what a machine remembers of its speed. Without torch."""
+"""How long a run takes: the time left, and the speed remembered for each machine. Without torch."""

@@ -1,7 +1,7 @@
-"""What share of the processor time that a run could use it got; other programs on the machine take the rest.
+"""The share of its usable processor time that a run got; other programs on the machine take the rest.
 
-Linux counts of each thread how long it ran and how long it waited for a core. Elsewhere the share is not known, and
-taken for 1.
+Linux counts for each thread how long it ran and how long it waited for a core. Elsewhere the share is unknown and
+assumed to be 1.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class ProcessorShare:
         return ran / (ran + waited) if ran + waited >= LEAST_S else 1.0
 
     def look(self) -> None:
-        """Add up what all threads have run and waited until now."""
+        """Add up how long all threads have run and waited so far."""
         now = time.monotonic()
         for place, figures in _figures(str(os.getpid())):
             self._threads[place] = figures
@@ -49,7 +49,7 @@ class ProcessorShare:
 
     @contextmanager
     def watching(self) -> Iterator[None]:
-        """Look again and again: a child that ends takes its figures with it."""
+        """Call `look` repeatedly: the figures of a child that ends are lost."""
         ended = threading.Event()
 
         def watch() -> None:
@@ -68,7 +68,7 @@ class ProcessorShare:
 
 
 def _figures(process: str) -> Iterator[tuple[tuple[str, str], tuple[float, float]]]:
-    """Of each thread of a process and of its children: seconds on a core, and seconds of waiting for one."""
+    """For each thread of a process and its children: seconds on a core, and seconds of waiting for one."""
     try:
         threads = list(Path("/proc", process, "task").iterdir())
     except OSError:  # it has ended, or the system has no such files

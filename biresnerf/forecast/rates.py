@@ -1,4 +1,4 @@
-"""The seconds that units of work take on this machine, as its runs measured them: kept from one run to the next."""
+"""Seconds per unit of work on this machine, measured by its runs and kept from one run to the next."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class MachineRates:
 
 
 def machine_rates(device: str, threads: int) -> MachineRates:
-    """Those of a kind of device with so many threads."""
+    """The rates of a kind of device with so many threads."""
     general = {unit: rate / threads for unit, rate in RATES.items()}
     runs = _read().get(f"{device} {threads}", {})
     known = {unit: median_low(runs[unit]) for unit in general if runs.get(unit)}
@@ -59,7 +59,7 @@ def machine_rates(device: str, threads: int) -> MachineRates:
 
 
 def latest_machine(threads: int) -> tuple[str, int]:
-    """The kind of device of the latest run here, and its threads: so many, if any run on that device had so many."""
+    """The kind of device of the latest run here, and its threads: ``threads`` if any run on it used as many."""
     names = [name.split(" ") for name in _read()]
     known = [(name[0], int(name[1])) for name in names if len(name) == 2 and name[1].isdecimal()]
     if not known:
@@ -86,13 +86,13 @@ def remember_rates(device: str, threads: int, rates: Mapping[Unit, float]) -> No
 
 
 def cache_folder() -> Path:
-    """Where what was found out of this machine is kept."""
+    """The folder for what was measured on this machine."""
     base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     return Path(base, "biresnerf")
 
 
 def _read() -> dict[str, dict[str, list[float]]]:
-    """Of each machine the seconds of each unit, the latest run last; none where the file is damaged."""
+    """Seconds of each unit by machine, the latest run last; empty if the file is damaged."""
     try:
         return _REMEMBERED.validate_json((cache_folder() / RATES_FILE).read_bytes())
     except (OSError, ValueError):

@@ -59,7 +59,7 @@ class Forecast:
         rates: seconds of each unit of work.
         left: amount of work in each phase, in its unit; phases that are over or will not be are not in it.
         step_weights: units of work in a step of either stage.
-        share: of the steps asked for, how many will be taken.
+        share: the share of the requested steps that will be taken.
     """
 
     def __init__(
@@ -84,24 +84,24 @@ class Forecast:
         self._fraction = 0.0
 
     def plan(self, step_weights: Mapping[Phase, float], share: float) -> None:
-        """So many units of work are in a step of either stage, and so many of the steps asked for will be taken."""
+        """Set the units of work in a step of either stage, and the share of the requested steps that will be taken."""
         self.step_weights, self.share = dict(step_weights), share
 
     def expect(self, amounts: Mapping[Phase, float], *, alone: bool = False) -> None:
-        """So much is left of these phases, and nothing of others where they are ``alone``."""
+        """Set the work left in these phases, and in others to nothing if ``alone``."""
         self.left = dict(amounts) if alone else {**self.left, **amounts}
 
     def pauses(self, seconds: float) -> None:
-        """What took so long, as the compilation of kernels, is no part of the run: the next will not have it."""
+        """Exclude seconds such as those of compiling kernels from the run: the next run will not need them."""
         self._began += seconds
 
     def continues(self, seconds: float) -> None:
-        """The run has taken so long before it was interrupted."""
+        """Set how long the run took before it was interrupted."""
         self._earlier_s = seconds
 
     @contextmanager
     def within(self, phase: Phase, amount: float | None = None) -> Iterator[None]:
-        """Around a phase, or so much of it: all that is left, if not given. Where it ends, its rate is known."""
+        """The context of ``amount`` of a phase, by default all that is left. Its rate is measured at the end."""
         amount = self.left.get(phase, 0.0) if amount is None else amount
         later = max(0.0, self.left.get(phase, 0.0) - amount)
         self.left[phase] = amount
@@ -115,18 +115,18 @@ class Forecast:
             self._phase, self._later = None, 0.0
 
     def enter(self, phase: Phase) -> None:
-        """A phase begins, and with it the one before ends."""
+        """Begin a phase, which ends the one before."""
         if phase != self._phase:
             self.leave()
             self._phase, self._phase_began, self._done = phase, time.monotonic(), 0.0
 
     def took(self, amount: float) -> None:
-        """The phase, which ends now, was so much work."""
+        """Correct the amount of work of the phase, which ends now."""
         if self._phase is not None:
             self.left[self._phase] = amount
 
     def leave(self) -> None:
-        """The phase is over."""
+        """End the phase and measure its rate."""
         if self._phase is None:
             return
         amount = self.left.pop(self._phase, 0.0)
@@ -141,20 +141,20 @@ class Forecast:
         self._phase = None
 
     def _slower_so_far(self) -> float:
-        """Of all that was measured long enough to tell: what it took over what was expected."""
+        """Seconds taken over seconds expected, for all that was measured long enough."""
         told = {unit: s for unit, s in self._measured.items() if s >= TELLING_S}
         expected = sum(s * self._expected[unit] / self.rates[unit] for unit, s in told.items())
         return sum(told.values()) / expected if told else 1.0
 
     def advance(self, share: float) -> None:
-        """So much of the phase is done."""
+        """Set the share of the phase that is done."""
         self._done = min(1.0, max(0.0, share))
 
     def stepped(self, stage: Literal["coarse", "fine"], seconds: float) -> None:
         """Add the time of one step. The first of a stage does not count: kernels may be compiled in it.
 
-        What was not measured yet is expected to be as much slower than thought as the steps are; before them, as all
-        that was measured.
+        Work not measured yet is expected to be slower than predicted by the same factor as the steps; before them, by
+        that of all measured work.
         """
         unit = UNITS[stage]
         before = self._steps.get(unit, 0)
@@ -170,12 +170,12 @@ class Forecast:
             self._slower = self.rates[unit] / self._expected[unit]
 
     def plan_steps(self, coarse: int, fine: int) -> None:
-        """So many steps of either stage are left."""
+        """Set how many steps of either stage are left."""
         self.left["coarse"] = coarse * self.step_weights["coarse"]
         self.left["fine"] = fine * self.step_weights["fine"]
 
     def seconds(self, phase: Phase) -> float:
-        """How long what is left of a phase is expected to take."""
+        """The seconds that the rest of a phase is expected to take."""
         amount = self.left.get(phase, 0.0)
         expected = amount * self._rate(UNITS[phase])
         if phase != self._phase or amount == 0:
@@ -209,9 +209,9 @@ class Forecast:
         return self._share(now - BUSY_S, now) < BUSY
 
     def measured(self, least_s: float = 0.0) -> dict[Unit, float]:
-        """The rates that this run has measured over at least so many seconds, as they are on an idle machine.
+        """The rates that this run measured over at least so many seconds, converted to an idle machine.
 
-        Steps that are too light to tell of others are left out.
+        Steps too light to be representative are left out.
         """
         found: dict[Unit, float] = {}
         for unit, seconds in self._measured.items():

@@ -1,1 +1,1 @@
-"""Which of two sets of poses is better: one function from paired figures to a finding, and the rules it is given."""
+"""Which of two sets of poses is better: one function from paired figures to a finding, and its rules."""

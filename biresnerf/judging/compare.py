@@ -1,6 +1,6 @@
-"""From figures of two sets of poses, taken of the same views, cameras or matches, to what they say; and all rules.
+"""Compare two sets of poses by figures measured on the same views, cameras or matches; and all rules.
 
-docs/verdict.md says who asks by which.
+docs/verdict.md says which decision uses which rule.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ class Rule:
 
     Attributes:
         least: the gain that matters, in the figure's unit.
-        errors: half the interval, in standard errors; None: Student's at 95 %; 0: chance has no say, one gain will do.
-        fewest: gains that say anything.
+        errors: half the interval, in standard errors; None: Student's at 95 %; 0: chance is ignored, one gain suffices.
+        fewest: gains that are needed for a finding.
         beyond: the whole interval lies above it, in the figure's unit.
     """
 
@@ -80,7 +80,7 @@ BEHIND = Rule(least=1e-9, errors=1.0)
 
 
 class Compared(NamedTuple):
-    """The mean gain, its interval (None of too few gains) and what it says."""
+    """The mean gain, its interval (None for too few gains) and the finding."""
 
     mean: float
     low: float | None
@@ -89,7 +89,7 @@ class Compared(NamedTuple):
 
 
 def compare(gains: Array | float, rule: Rule) -> Compared:
-    """What gains [n] say of a set of poses: positive ones speak for it, whatever the figure."""
+    """What gains [n] say about a set of poses: positive ones support it, whatever the figure."""
     each = np.atleast_1d(gains)
     count, mean = len(each), float(each.mean()) if np.size(each) else math.nan
     if count < max(rule.fewest, 1 if rule.errors == 0 else 2):
@@ -110,12 +110,12 @@ def compare(gains: Array | float, rule: Rule) -> Compared:
 
 
 def is_better(gains: Array | float, rule: Rule) -> bool:
-    """Whether gains [n] speak for a set of poses."""
+    """Whether gains [n] support a set of poses."""
     return compare(gains, rule).finding == "better"
 
 
 def paired(before: Array, after: Array, rule: Rule, gains: Array | None = None) -> PairedDifference:
-    """The comparison of a figure [n] of which more is better, or else by its `gains` [n], for a report."""
+    """The comparison of a figure [n], for a report; by its `gains` [n] where larger is not better."""
     mean, low, high, finding = compare(after - before if gains is None else gains, rule)
     return PairedDifference(
         count=len(before), before=float(before.mean()), after=float(after.mean()),

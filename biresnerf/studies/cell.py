@@ -144,7 +144,7 @@ class Outcome(FrozenModel):
 
     @property
     def run_s(self) -> float:
-        """All of the run, but for what measured it."""
+        """Seconds of the whole run, without measuring it."""
         return sum(seconds for name, seconds in self.seconds.items() if name != TEST_VIEWS)
 
     @property
