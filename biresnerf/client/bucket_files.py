@@ -77,7 +77,7 @@ def _client(bucket: str) -> Any:
 
 @contextmanager
 def _told(address: str) -> Iterator[None]:
-    """Faults of credentials, network and bucket in our words."""
+    """Raise `InputError` for faults of credentials, network and bucket."""
     with needs_extra("s3"):
         from botocore.exceptions import BotoCoreError, ClientError
     try:

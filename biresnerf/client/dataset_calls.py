@@ -59,7 +59,7 @@ class DatasetCalls(Transport):
         return made
 
     async def fetches(self, dataset_id: str) -> list[UploadView]:
-        """What of these files is not in the dataset yet, and what was rejected."""
+        """Which of these files are not in the dataset yet, and which were rejected."""
         return list(
             parse(await self._ask(Call("GET", f"{dataset_url(dataset_id)}/fetches")), UploadList).items
         )

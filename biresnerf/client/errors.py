@@ -27,7 +27,7 @@ class ServiceError(FaultError):
         status: the HTTP status; 0 where there was no answer.
         where, hint: the file or field at fault, and what to do about it; empty where the service does not say.
         errors: every wrong field by its pointer.
-        request_id: by which the service's log knows the request; none where there was no answer.
+        request_id: the request's id in the service's log; none where there was no answer.
         retry_after_s: how long the service asks to wait.
     """
 

@@ -155,7 +155,7 @@ class JobCalls(Transport):
         return parse(await self._ask(Call("GET", f"{job_url(job_id)}/report")), Report)
 
     async def compare(self, job_id: str, other_id: str) -> Comparison:
-        """Which of two jobs' results is better and by what, the first one's or the other's; or why nobody can know."""
+        """Which of two jobs' results is better, the first one's or the other's, and by what; or why that is unknown."""
         answer = await self._ask(Call("GET", f"{job_url(job_id)}/comparison/{other_id}"))
         return parse(answer, Comparison)
 

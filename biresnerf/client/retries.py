@@ -21,7 +21,7 @@ class RetryPolicy:
     Attributes:
         patience_s: how long a failing operation is retried.
         on_pause: called with the error and the seconds until the next try.
-        answered: the service has answered before. One that never did has most likely another address.
+        answered: whether the service has answered before. If it never has, the address is most likely wrong.
     """
 
     patience_s: float

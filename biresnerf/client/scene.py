@@ -14,8 +14,8 @@ TRANSFORMS = "transforms.json"
 def look_at(path: Path, video_frames: int = 0) -> list[tuple[str, Path]]:
     """The files that make up the input at ``path``: poses with the images and masks they name, or images alone.
 
-    Each comes with its name in the dataset. Of videos it is the frames, as many as the option ``video_frames`` says,
-    which are written beside them.
+    Each comes with its name in the dataset. For a video, its frames are written beside it and sent, as many as the
+    option ``video_frames`` says.
 
     Raises:
         InputError: the input cannot be used, or an image is outside its folder.

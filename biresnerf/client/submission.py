@@ -56,8 +56,8 @@ class Submissions(DatasetCalls, JobCalls, Uploads):
         """Sends the missing files of a set, or has all of them fetched, has them checked, and queues a job.
 
         If the service refuses the files, the dataset is deleted there. If the connection fails or the caller stops,
-        it stays: the same submission with ``resume`` sends the rest, or returns the job if it is queued already. What
-        the service fetches goes on without the caller.
+        it stays: the same submission with ``resume`` sends the rest, or returns the job if it is queued already.
+        Fetches by the service continue without the caller.
 
         Args:
             source: a folder (or file with poses), or addresses of files that the service fetches itself; see

@@ -191,7 +191,7 @@ async def tell(callback: Callable[..., object], *facts: object) -> None:
 
 
 async def looks() -> AsyncIterator[None]:
-    """Again and again, with growing pauses: to look at what the service is doing."""
+    """Yields repeatedly, with growing pauses, for polling the service."""
     pause_s = _POLL_S
     while True:
         yield
@@ -200,7 +200,7 @@ async def looks() -> AsyncIterator[None]:
 
 
 async def run_together(works: Iterable[Callable[[], Awaitable[object]]], at_once: int = 4) -> None:
-    """Runs them, ``at_once`` at a time; the first that fails cancels the others and is raised."""
+    """Runs ``works``, ``at_once`` at a time; the first failure cancels the others and is raised."""
     waiting = iter(works)
 
     async def lane() -> None:
@@ -240,7 +240,7 @@ def _refusal(response: httpx.Response) -> ServiceError:
 
 
 def _unreachable(url: str, call: Call, error: httpx.TransportError) -> ServiceError:
-    """There was no answer, or only a part of one."""
+    """The error for a missing or incomplete answer."""
     if isinstance(error, httpx.LocalProtocolError) and call.content is not None:
         return ServiceError(
             "file_changed",

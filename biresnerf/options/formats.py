@@ -43,9 +43,9 @@ class Format:
         gives: what reading it gives, for the docs.
         checked_against: what its reader was tested with, for the docs.
         in_set: where `convert` writes it in its folder; empty for formats that it does not write.
-        in_result: where it lies in the folder of a result; the same place where left out.
+        in_result: where it lies in the folder of a result; default: `in_set`.
         always: every result has it.
-        axes, cam_from_world, quaternion: how it has poses, for questions whether a file means what the format says: the
+        axes, cam_from_world, quaternion: how it writes poses, to check whether a file means what the format says: the
             camera's axes, whether world to camera, and the order of its quaternions.
         needs: ``photos``: the input's photos; ``images folder``: all of them directly in images/; ``lens file``: a
             camera.json beside it, as it has no lenses; ``bounds``: depths of the nearest and farthest point; ``input``:
@@ -95,7 +95,7 @@ class Format:
 
     @property
     def holds_bodies(self) -> bool:
-        """Whether it holds poses without what cameras see, so that those of a robot's flange have a place in it."""
+        """Whether it holds poses without points or photos, so that it can hold those of a robot's flange."""
         return "points" in self.loses and "poses" not in self.loses and "photos" not in self.needs
 
     @property
@@ -115,7 +115,7 @@ def formats() -> dict[str, Format]:
 
 
 def _source_of(module: str) -> Path:
-    """The file of a module, which is not imported; the packages that it lies in are."""
+    """The file of a module, without importing it; its parent packages are imported."""
     found = find_spec(module)
     if found is None or found.origin is None:
         raise ModuleNotFoundError(

@@ -1,4 +1,4 @@
-"""What a file's poses may be instead of what its format says; `biresnerf.data.given_poses` reads them so."""
+"""What a file's poses may mean instead of what its format says; `biresnerf.data.given_poses` reads them so."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def in_words(reading: Sequence[PoseReading]) -> str:
 
 
 def refuse_contradictions(reading: Sequence[PoseReading]) -> Sequence[PoseReading]:
-    """The same; raises ValueError for two that cannot both be."""
+    """Returns ``reading``; raises ValueError for two that contradict each other."""
     for group in EITHER:
         both = [one for one in reading if one in group]
         if len(both) > 1:

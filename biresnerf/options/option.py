@@ -25,7 +25,7 @@ class Option:
         changes_result: whether poses, field or verdict depend on it. Other options may change when a run resumes.
         level: main: what forms show first; usual: for every user; expert: for users who know the method; research: for
             experiments with the method; forms show the learning rates alone, last.
-        smaller: from the value of a try that ran out of memory to that of the next; None if it saves none.
+        smaller: maps the value of an attempt that ran out of memory to that of the next; None if it saves none.
     """
 
     stage: Stage
@@ -57,7 +57,7 @@ def lowered(by: int, least: int) -> Callable[[int], int]:
 
 
 def _listed(names: Any) -> Any:
-    """As a tuple, which JSON does not have."""
+    """A list as a tuple, which JSON lacks."""
     if not isinstance(names, list | tuple):
         raise ValueError("must be a list")
     return tuple(names)

@@ -104,7 +104,7 @@ def preset_values(
 
 
 def in_proportion(values: Mapping[str, Any], steps: int) -> dict[str, int]:
-    """What follows from so many steps in place of those that the values have."""
+    """The values that depend on the number of steps, scaled to `steps`."""
     ratio = steps / values["steps"]
     # In proportion, trials would be too short to distinguish good poses from better ones.
     trial = {"trial_steps": min(values["trial_steps"], max(FEWEST_OF_STAGE, steps // 4))}

@@ -318,7 +318,7 @@ class ResolvedOptions(_Options[Never, ComputeDevice]):
     model_config = ConfigDict(title="Resolved options", validate_default=True, json_schema_extra=all_required)
 
     def with_steps(self, steps: int) -> ResolvedOptions:
-        """The same with so many steps; what keeps its proportion to them does."""
+        """The same with so many steps; values in proportion to them are scaled."""
         return self.model_copy(update={"steps": steps, **in_proportion(self.model_dump(), steps)})
 
 

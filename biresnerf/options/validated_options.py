@@ -15,7 +15,7 @@ Parsed = TypeVar("Parsed", bound=BaseModel)
 
 
 def with_near_names(error: ValidationError, model: type[BaseModel]) -> ValidationError:
-    """The same error, in which a key that is no field of `model` is answered with the nearest one."""
+    """The same error, which suggests the nearest field of `model` for each unknown key."""
     details = []
     for item in error.errors():
         detail = InitErrorDetails(

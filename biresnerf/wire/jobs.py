@@ -54,7 +54,7 @@ class JobProgress(Record):
 
 
 class JobUse(Record):
-    """What the attempts of a job used that are over, however they ended."""
+    """What the finished attempts of a job used, however they ended."""
 
     processor_s: float = Field(
         0.0,

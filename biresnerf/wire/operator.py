@@ -35,7 +35,7 @@ class RunningJob(Record):
 
 
 class SlotView(Record):
-    """A worker slot: a refinement at a time, and an export beside it."""
+    """A worker slot: it runs one refinement at a time, and one export beside it."""
 
     host: str = Field(examples=["gpu-1"])
     name: str = Field(examples=["gpu0"])

@@ -109,6 +109,6 @@ class NewLinkView(LinkView):
 
 
 class LinkList(Record):
-    """The living links to a job."""
+    """The active links to a job."""
 
     items: tuple[LinkView, ...]

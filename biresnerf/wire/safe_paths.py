@@ -37,7 +37,7 @@ def checked_path(name: str) -> str:
 
 
 def _problem(name: str, kept: str) -> str | None:
-    """What is wrong with a name, of which `kept` is left without parts `.`."""
+    """What is wrong with a name; `kept` is the name without parts `.`."""
     parts = kept.split("/")
     # U+FFFD stands where bytes could not be decoded.
     if any(char == "\ufffd" or unicodedata.category(char) in {"Cc", "Cs", "Zl", "Zp"} for char in name):

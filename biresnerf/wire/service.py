@@ -41,7 +41,7 @@ UsageKey = Literal["day", "tenant", "key", "device"]
 
 
 class UsageRow(Record):
-    """What attempts used that ended in a time. What the rows are not split by is null."""
+    """What attempts that ended in a period used. Fields that the rows are not split by are null."""
 
     day: date | None = Field(None, description="In UTC.")
     tenant: str | None = Field(None, examples=["anna"])
@@ -54,7 +54,7 @@ class UsageRow(Record):
 
 
 class UsageList(Record):
-    """Use in a time."""
+    """Usage in a period."""
 
     items: tuple[UsageRow, ...]
 

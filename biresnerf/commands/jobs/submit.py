@@ -59,7 +59,7 @@ label_option = click.option(
 
 
 class _SetParameter(click.ParamType):
-    """A local path, or an address as it is."""
+    """A local path, or an unchanged address."""
 
     name = "path"
 
@@ -193,7 +193,7 @@ def _sending(*, again_as_it_is: bool) -> Iterator[Callable[[Sending], None]]:
 
 
 def _source(path: Path | str) -> Path | Sequence[FileAddress]:
-    """What the client submits: a local path as it is, an address as those of its files."""
+    """What the client submits: a local path unchanged, or the addresses of the files at an address."""
     from biresnerf.client import FileAddress, bucket_files
 
     if isinstance(path, Path):

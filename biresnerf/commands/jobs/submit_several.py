@@ -48,7 +48,7 @@ def name_of(path: Path | str) -> str:
 
 
 def named(paths: Sequence[Path | str]) -> dict[str, Path | str]:
-    """The sets, each by a name of its own."""
+    """The sets by names that are unique."""
     found: dict[str, Path | str] = {}
     for path in paths:
         name, count = name_of(path), 1

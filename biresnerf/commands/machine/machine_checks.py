@@ -158,7 +158,7 @@ CHECKS: Sequence[Check] = (versions, processor, kernels, gpu, colmap, photos, vi
 
 
 def _in_child(name: str, code: str, limit_s: float, hint: str) -> str | Found:
-    """What Python code prints in a process of its own; or a broken check ``name`` if it fails."""
+    """What Python code prints in a child process; or a broken check ``name`` if it fails."""
     try:
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=limit_s)
     except subprocess.TimeoutExpired:

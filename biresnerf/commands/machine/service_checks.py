@@ -208,7 +208,7 @@ def _room(info: Info) -> Found:
 
 
 def _upload(client: Client) -> Found:
-    """Pictures go the whole way: sent, stored, read by the check, and deleted."""
+    """Send pictures the whole way: uploaded, stored, read by the check, and deleted."""
     began = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         files = list(_pictures(Path(folder)))

@@ -183,7 +183,7 @@ def start_in_words(dataset: Dataset, options: ResolvedOptions) -> str:
 
 
 def in_minutes(least_s: float, most_s: float) -> str:
-    """A predicted time, no more exact than it is."""
+    """A predicted time, rounded to its precision."""
     least, most = _amount_and_unit(least_s), _amount_and_unit(most_s)
     if least == most:
         return " ".join(most)

@@ -102,11 +102,11 @@ def make_scene(
     """Writes a set of a kind of `KINDS` to `output`, and its true poses to OUTPUT.truth.json.
 
     Args:
-        own: a set with poses, in any form that is read, to make wrong instead of rendering one.
-        size: width of the images (px), of those rendered.
-        noise: standard deviation of the poses' noise, as BARF has it, of the kinds that are turned at random; the share
-            by which a turntable's steps are uneven.
-        camera: one of `CAMERAS`, of those rendered; None: as usual for the kind.
+        own: a set with poses, in any readable format, to perturb instead of rendering one.
+        size: width (px) of rendered images.
+        noise: standard deviation of the pose noise, as in BARF, for the kinds with random noise; for a turntable, the
+            share by which its steps are uneven.
+        camera: one of `CAMERAS`, for rendered images; None: the usual one for the kind.
 
     Raises:
         InputError: `output` is not empty, or `own` cannot be read or lacks poses.
@@ -203,7 +203,7 @@ def _perturb_file(dataset: Dataset, path: Path, kind: str, noise: float, seed: i
 
 
 def _take_poses_away(path: Path) -> None:
-    """Leaves of a transforms file the images and their lens."""
+    """Removes the poses from a transforms file; the images and their lens stay."""
     import json
 
     document = json.loads(path.read_text("utf-8"))
