@@ -1,4 +1,4 @@
-"""The array that numbers are in, where not said otherwise."""
+"""The array type of numbers: float64 unless stated otherwise."""
 
 from __future__ import annotations
 

@@ -102,7 +102,7 @@ SECTIONS = (
 
 
 class _LazyCommands(click.Group):
-    """The commands of `SECTIONS`, each imported when it is asked for."""
+    """The commands of `SECTIONS`, each imported when it is first used."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return sorted(name for section in SECTIONS for name in section.commands)

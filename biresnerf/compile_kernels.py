@@ -1,7 +1,7 @@
 """Compile all CPU kernels, or load them from Numba's cache: `python -m biresnerf.compile_kernels`.
 
-A run does so in processes of their own, while it reads photos and matches them (`KernelCompilation`). Run at install
-time, it keeps a minute and a half of processor time off the first refinement.
+A run compiles them in separate processes while it reads and matches photos (`KernelCompilation`). Compiling at install
+time saves the first refinement a minute and a half of processor time.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ SIZE, BASELINE = 32, 0.125  # px, and as a share of the distance to the scene: f
 
 
 class KernelCompilation:
-    """Compiles kernels in other processes, which this one then loads from the cache. A context that ends them."""
+    """Compiles kernels in other processes and loads them from the cache. As a context, ends those processes."""
 
     def __init__(self) -> None:
         self._children: list[subprocess.Popen[bytes]] = []
@@ -57,7 +57,7 @@ class KernelCompilation:
             child.wait()
 
     def start(self, *, field: bool) -> bool:
-        """Begin, and say whether there is anything to compile. The field's kernels may run elsewhere."""
+        """Start compiling, the field's kernels only if ``field``; returns whether there is anything to compile."""
         self._field = field
         if _stamp(field).exists():
             return False
@@ -83,7 +83,7 @@ class KernelCompilation:
 
 
 def compile_kernels(*, field: bool = True) -> None:
-    """Every kernel of the adjustment, and of the field unless that runs elsewhere."""
+    """Compile every kernel of the adjustment, and those of the field if ``field``."""
     if field:
         compile_field_kernels()
         _cast_one_ray()
@@ -96,7 +96,7 @@ def compile_kernels(*, field: bool = True) -> None:
 
 
 def _stamp(field: bool) -> Path:
-    """A file that says that these kernels were compiled here: for this processor, and from these sources."""
+    """The file that marks these kernels as compiled here, for this processor and from these sources."""
     target = (numba.__version__, sys.version, config.CPU_NAME, config.CPU_FEATURES)  # type: ignore[attr-defined]
     sources = sorted(
         (path.as_posix(), path.stat().st_mtime_ns) for path in Path(__file__).parent.rglob("*.py")
@@ -107,7 +107,7 @@ def _stamp(field: bool) -> Path:
 
 @cache  # a process that has done it has them
 def compile_field_kernels(*, backward: bool = True) -> None:
-    """Every kernel once on a tiny field, on the way a step takes; or only what renders."""
+    """Run every kernel once on a tiny field, as a step does; without ``backward`` only those that render."""
     shape = FieldShape(grid_levels(2, 4, 8, 10), grid_levels(2, 16, 32, 10), unbounded=False)
     field = CpuField(shape, 0, torch.device("cpu"), workers=1)
     field.start_reconstruction()
@@ -127,7 +127,7 @@ def compile_field_kernels(*, backward: bool = True) -> None:
 
 @cache
 def _cast_one_ray() -> None:
-    """One pixel of one photo, on the way a step takes."""
+    """Cast the ray of one pixel of one photo, as a step does."""
     cpu = torch.device("cpu")
     photo, one, nowhere = np.zeros((1, 3), np.uint8), np.zeros(1, np.int64), np.zeros((1, 2), np.float32)
     colour, weight = np.zeros((1, 3), np.float32), np.zeros(1, np.float32)
@@ -145,7 +145,7 @@ def _cast_one_ray() -> None:
 
 @cache
 def _adjust_two_cameras() -> None:
-    """Two cameras side by side look at a wall of vertical waves, on which points are tracked."""
+    """Adjust two cameras side by side that look at a wall of vertical waves with tracked points."""
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[1, 0, 3] = BASELINE
     intrinsics = Intrinsics.from_cameras(
@@ -166,7 +166,7 @@ def _adjust_two_cameras() -> None:
 
 
 def _compile_part(part: str) -> None:
-    """Two parts take about as long as each other: ``render``, a field's way forward, and ``rest``."""
+    """Compile a part; two take equally long: ``render``, the field's forward pass, and ``rest``."""
     if part == "render":
         compile_field_kernels(backward=False)
         return

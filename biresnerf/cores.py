@@ -6,5 +6,5 @@ import os
 
 
 def usable_cores() -> int:
-    """How many; fewer than the machine has where the process is bound to some of them."""
+    """Number of usable cores; fewer than the machine has where the process is bound to some of them."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,4 +1,4 @@
-"""How OpenMP's threads behave; to be said before torch is loaded, whose OpenMP the kernels share."""
+"""How OpenMP's threads wait; to be set before torch is loaded, whose OpenMP the kernels share."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import os
 
 
 def let_waiting_threads_sleep() -> None:
-    """Threads that wait leave their cores to others, unless the user has said how they wait.
+    """Let waiting threads yield their cores, unless the user has set how they wait.
 
-    By itself libgomp has them spin first. A run gains nothing by it, and jobs side by side take each other's cores.
+    By default, libgomp lets them spin first. A run gains nothing from that, and concurrent jobs compete for cores.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")

@@ -62,10 +62,10 @@ from biresnerf.write.result import ResultPictures, write_result
 
 @dataclass(frozen=True)
 class Observer:
-    """Looks into a run on its way; the run does not depend on what it sees.
+    """Observes a run in progress; the run does not depend on what it sees.
 
     Attributes:
-        at_check: what it returns of the poses [n, 4, 4] at each check joins that check's line of the history.
+        at_check: called with the poses [n, 4, 4] at each check; its result joins that check's line of the history.
         at_end: called once, when the poses are final.
     """
 
@@ -87,25 +87,25 @@ def refine_poses(
 ) -> Report:
     """Refine the poses of an image set; all results go to the folder `output`.
 
-    Continues where a run of the same input and options left a checkpoint in `output`, and begins with stage 2 where
-    one that differs in options of stage 2 alone left the end of its stage 1 there.
+    Continues from a checkpoint that a run of the same input and options left in `output`. Begins with stage 2 if a run
+    that differs only in options of stage 2 left the end of its stage 1 there.
 
     Args:
         input: a folder of images (with or without a transforms file), a transforms file, or a set already read.
         output: a folder that is empty, new, or holds an unfinished run of the same input and options.
         on_progress: called with a `Progress` a few times a second.
-        should_stop: asked after every step, view, frame and photo; once true, a checkpoint and a partial result are
+        should_stop: called after every step, view, frame and photo; once true, a checkpoint and a partial result are
             written.
-        observer: looks into the run, for comparisons with the truth.
-        method: in place of the one that the options name, e.g. ``dataclasses.replace(BIRESNERF, repair=False)``.
+        observer: observes the run, for comparisons with the truth.
+        method: replaces the one that the options name, e.g. ``dataclasses.replace(BIRESNERF, repair=False)``.
         keep_reusable: leave in `output`/checkpoint what other runs of the set can start from.
         title: heading of the report; by default the name of the folder of a set already read.
 
     Raises:
         InputError: the user can fix it.
         RefinementError: the optimisation diverged.
-        Interrupted: stopped by `should_stop`; the checkpoint and a partial result are in `output`, or nothing
-            yet where initial poses were still being looked for.
+        Interrupted: stopped by `should_stop`; the checkpoint and a partial result are in `output`, or nothing yet if
+            initial poses were still being computed.
     """
     started, share = time.monotonic(), ProcessorShare()
     if title is None and isinstance(input, Dataset):
@@ -117,7 +117,7 @@ def refine_poses(
 
 
 def _title_of(root: Path) -> str | None:
-    """The set's name, for its report; None of a folder whose name says nothing."""
+    """The set's name, for its report; None for a folder whose name says nothing."""
     name = root.resolve().name
     return None if name in ("", "input", "images") else name
 
@@ -222,7 +222,7 @@ def _read(path: Path, setup: _Setup) -> Dataset:
 
 
 def _as_meant(dataset: Dataset, setup: _Setup) -> Dataset:
-    """The set with given poses read as the user says, or a warning that they seem to be meant in another way.
+    """The set with given poses read as the user says; else with a warning if they seem to mean something else.
 
     Panoramas are cut into views.
     """
@@ -279,7 +279,7 @@ def _seed(dataset: Dataset, setup: _Setup) -> tuple[Scene, RunOrigin]:
 
 
 def _photo_counter(count: int, setup: _Setup) -> Callable[[int], None]:
-    """Tells every tenth of the photos that is decoded, and stops between two of them."""
+    """A callback that reports each tenth of the photos decoded, and can stop the run between two photos."""
     stage: Stage = "seeding" if (setup.folder.path / SEEDING).is_file() else "preparing"
     watch = told_before_the_run(setup.monitor.report, setup.monitor.should_stop, stage)
     return lambda done: watch(f"reading {count} photos: {10 * (10 * done // count)} %")

@@ -49,9 +49,9 @@ OnProgress = Callable[[Progress], None]
 def told_before_the_run(
     on_progress: OnProgress, should_stop: Callable[[], bool], stage: Stage = "preparing"
 ) -> Callable[[str], None]:
-    """A function to call with what is being done while the input is read: tells what is new, and ends it on request.
+    """A callback for what is being done while the input is read; it reports each change once.
 
-    It raises `Interrupted` where ``should_stop`` says so.
+    It raises `Interrupted` if ``should_stop`` returns true.
     """
     last = ""
 
@@ -68,12 +68,12 @@ def told_before_the_run(
 
 @dataclass(frozen=True)
 class Monitor:
-    """Whoever follows a run.
+    """The callbacks of a caller that follows a run.
 
     Attributes:
         on_progress: called with each `Progress`.
-        should_stop: asked after every step, view, frame and photo; once true, the run ends with `Interrupted`.
-        forecast: says of each report how far the run is.
+        should_stop: called after every step, view, frame and photo; once true, the run ends with `Interrupted`.
+        forecast: gives each report the fraction done and the time left.
     """
 
     on_progress: OnProgress = lambda _progress: None
@@ -81,7 +81,7 @@ class Monitor:
     forecast: Forecast = field(default_factory=Forecast)
 
     def report(self, progress: Progress) -> None:
-        """Tell what is done, with the fraction and the time left as they are now."""
+        """Report what is being done, with the current fraction and time left."""
         fraction, eta_s = self.forecast.now()
         metrics = {**progress.metrics, "machine_busy": float(self.forecast.machine_is_busy())}
         self.on_progress(
@@ -89,7 +89,7 @@ class Monitor:
         )
 
     def report_end(self, steps: int) -> None:
-        """The run is complete, after so many steps."""
+        """Report that the run is complete, after so many steps."""
         self.on_progress(Progress(stage="exporting", step=steps, steps_total=steps, fraction=1.0, eta_s=0.0))
 
     def raise_if_stopped(self, message: str) -> None:

@@ -23,10 +23,10 @@ Finding = Literal["better", "worse", "same", "open"]
 
 
 class PairedDifference(FrozenModel):
-    """One figure for the input's poses and for the refined ones, taken of the same views or images.
+    """One figure for the input's poses and for the refined ones, measured on the same views or images.
 
-    `difference` is the mean over them of how much better the refined poses are: positive is better, whatever the
-    figure. The interval is Student's, at 95 %.
+    `difference` is the mean gain of the refined poses over these: positive is better, whatever the figure. The interval
+    is Student's, at 95 %.
     """
 
     count: int = Field(examples=[18], description="Views or images that the figure was taken of.")
@@ -82,7 +82,7 @@ class EpipolarEvidence(FrozenModel):
 
 
 class Verdict(FrozenModel):
-    """Whether the refined poses are better than the input's, and why that is said."""
+    """Whether the refined poses are better than the input's, and the reasons."""
 
     verdict: VerdictName
     returned: Literal["refined", "input"] = Field(
@@ -104,7 +104,7 @@ class Verdict(FrozenModel):
     epipolar: EpipolarEvidence | None = None
 
     def in_words(self) -> list[str]:
-        """The verdict in one sentence, whose poses the result holds, and a line for each proof."""
+        """The verdict in one sentence, whose poses the result holds, and a line for each piece of evidence."""
         ground, *proofs = self.why
         name = "not improved" if self.verdict == "kept_input" else self.verdict.replace("_", " ")
         return [
@@ -188,7 +188,7 @@ class ImageReport(FrozenModel):
 
     @property
     def flags(self) -> tuple[str, ...]:
-        """The names of all that is true of the image."""
+        """The names of the fields that are true for the image."""
         return tuple(name for name, value in self if value is True)
 
 
@@ -232,7 +232,7 @@ class HeldOut(FrozenModel):
 
 
 class TrialReport(FrozenModel):
-    """How poses to start from did: a short training with them held still, scored on views it was not shown."""
+    """How well candidate start poses did: a short training with the poses fixed, scored on unseen views."""
 
     source: PoseSource
     placed: int = Field(
@@ -245,7 +245,7 @@ class TrialReport(FrozenModel):
 
 
 class CandidateReport(FrozenModel):
-    """Poses that the result could have held, judged by evidence that none was fitted to: tracks and patches left out.
+    """Candidate poses for the result, judged by tracks and patches that none of them was fitted to.
 
     A misfit is the median over cameras of their mean robust square, in units of the measured noise: about 1 at poses
     that are as exact as the evidence, 9 where nothing fits.

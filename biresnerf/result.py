@@ -74,7 +74,7 @@ class Result:
 
     @property
     def verdict(self) -> Verdict | None:
-        """Whether refinement helped, and why; None of a partial result, and where none was asked for."""
+        """Whether refinement helped, and why; None for a partial result, or if no verdict was requested."""
         return self.report.verdict
 
     @cached_property
@@ -89,7 +89,7 @@ class Result:
 
     @property
     def poses_of_body(self) -> Array | None:
-        """world_from_body [n, 4, 4] of what carries the camera, a robot's flange or a phone, by the refined poses.
+        """Refined world_from_body [n, 4, 4] of the body that carries the camera, such as a robot's flange or a phone.
 
         As the input has them, where its poses were those of such a body (`input_accuracy.body_from_camera` in the
         report); None where no offset was found.
@@ -114,7 +114,7 @@ class Result:
         Args:
             names: of the formats, as docs/formats.md lists them: ``"nerfstudio", "llff"``.
             photos: the input's folder, which formats that hold photos need.
-            poses_of: ``"body"``: those of what carries the camera, into the folder body/.
+            poses_of: ``"body"``: those of the body that carries the camera, into the folder body/.
 
         Returns:
             the file or folder of each format.

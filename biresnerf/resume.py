@@ -26,9 +26,9 @@ from biresnerf.stages import OTHER_FOLDER, ReusableStage
 
 
 def earlier_work(folder: Path) -> Checkpoint | None:
-    """The checkpoint of an unfinished run, or the end of stage 1 of a run that shares it; None of neither.
+    """The checkpoint of an unfinished run, or the end of stage 1 of a run that shares it; None if there is neither.
 
-    COLMAP's answer is put back from it: a checkpoint may have come here without the rest of its folder.
+    COLMAP's answer is restored from it: the checkpoint may have been copied without the rest of its folder.
 
     Raises:
         InputError: ``checkpoint_invalid``.
@@ -86,6 +86,6 @@ def refuse_other_run(folder: Path, earlier: Checkpoint, origin: RunOrigin) -> No
 
 
 def reusable_seeding(folder: Path) -> dict[ReusableStage, tuple[str, ...]]:
-    """Files that another run can take COLMAP's answer from; nothing where COLMAP was not asked."""
+    """Files that another run can take COLMAP's answer from; empty if COLMAP did not run."""
     kept = tuple(path.as_posix() for path in (SEEDING, TRACKS) if (folder / path).is_file())
     return {"seeding": kept} if SEEDING.as_posix() in kept else {}

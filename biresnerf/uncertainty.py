@@ -1,4 +1,4 @@
-"""What a result says of how exact poses are, and GPS. No torch: the service reads it too."""
+"""What a result states about the accuracy of poses, and about GPS. No torch: the service reads it too."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _Row4 = tuple[float, float, float, float]
 class GeoReference(FrozenModel, allow_inf_nan=False):
     """Where the returned cameras lie among measured positions: GPS, or a table beside the photos.
 
-    Positions also bear on the shape of the rig, as exact as they say or as the residuals show, but not on its frame.
+    Positions also constrain the shape of the rig, weighted by stated accuracy or residuals, but not its frame.
     """
 
     source: str = Field(examples=["EXIF"], description="EXIF, or the file that has the positions.")
@@ -126,7 +126,7 @@ class KnownScale(FrozenModel, allow_inf_nan=False):
 class InputAccuracy(FrozenModel):
     """How accurate the input's poses are, measured against the poses that tracks and patches gave.
 
-    Standard deviations of each component of the errors, after alignment. The errors of the other poses are in them.
+    Standard deviations of each component of the errors, after alignment. They include the errors of those poses.
     """
 
     rotation_deg: float = Field(examples=[0.4])

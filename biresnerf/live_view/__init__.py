@@ -1,1 +1,1 @@
-"""A result, or a run under way, in three dimensions in a browser, by viser; it reads files only, and no torch."""
+"""A 3-D view of a result, or of a run in progress, in a browser, by viser. Reads files only; no torch."""

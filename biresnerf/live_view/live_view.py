@@ -48,7 +48,7 @@ class LiveView:
     """Shows the cameras of ``folder`` at `url`, with their photos, and moves them as its files change.
 
     Args:
-        photos: the input, for photos while the run is under way; a result has small ones of its own.
+        photos: the input, for photos while the run is in progress; a result holds small ones.
         host, port: to listen on; another port where this one is taken.
 
     Raises:
@@ -74,7 +74,7 @@ class LiveView:
         self.server.on_client_connect(self._look_at_all)
 
     def update(self) -> bool:
-        """Draw what is new in the folder; whether anything was."""
+        """Draw what is new in the folder; returns whether anything was."""
         try:
             poses = newest_poses(self._folder)
             now = None if poses is None else (poses, poses.stat().st_mtime_ns)
@@ -192,14 +192,14 @@ def _spread(seen: Seen) -> float:
 
 
 def _up(seen: Seen) -> NDArray[np.float64]:
-    """Against the mean of the pictures' downward axes; z where these cancel out."""
+    """The up direction: against the mean of the pictures' downward axes; z where these cancel out."""
     up = -seen.after[:, :3, 1].mean(0)
     length = float(np.linalg.norm(up))
     return up / length if length > 0.1 else np.array([0.0, 0.0, 1.0])
 
 
 def _first_look(seen: Seen) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """From where, and at what: at the middle of everything, from behind the first camera and above."""
+    """The first viewpoint, behind and above the first camera, and its target, the middle of everything."""
     centres = seen.after[:, :3, 3]
     middle = np.median(seen.points, axis=0) if len(seen.points) else centres.mean(0)
     away = centres[0] - middle + _up(seen) * _spread(seen)

@@ -1,4 +1,4 @@
-"""What there is to see of an output folder at one moment: of a run under way its preview, else its result."""
+"""What an output folder shows at one moment: the preview of a run in progress, else the result."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Seen:
 
 
 def newest_poses(folder: Path) -> Path | None:
-    """The file with the poses to show: of the run under way, else of the result; None while there is neither."""
+    """The file with the poses to show: of the run in progress, else of the result; None while there is neither."""
     running, done = folder / PREVIEW / POSES, folder / VIEW
     if running.is_file():
         return running
@@ -95,7 +95,7 @@ def photos_of(source: Path) -> dict[str, Picture]:
 
 
 def photos_of_result(folder: Path, seen: Seen) -> dict[str, Picture]:
-    """The photos on the contact sheet of a result by name; none while a run is under way, or of very many."""
+    """The photos on the contact sheet of a result by name; none during a run, or for very many photos."""
     sheet = read_view_file(folder).contact_sheet if (folder / VIEW).is_file() else None
     if sheet is None or not (folder / sheet.file).is_file():
         return {}

@@ -1,4 +1,4 @@
-"""Photos added to those of a finished result: these keep their poses and lenses, and the new ones join their frame."""
+"""Add photos to a finished result: its photos keep their poses and lenses, and the new ones join their frame."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def joined_to(dataset: Dataset, options: RefineOptions, result: Path) -> tuple[D
 
 
 def _shared(dataset: Dataset, now: list[int]) -> dict[int, int]:
-    """For each camera of the set, that of the result which all its known photos have, where that is one."""
+    """For each camera of the set, the result's camera that all its known photos share, if there is one."""
     known: dict[int, set[int]] = {}
     for frame, camera in zip(dataset.frames, now, strict=True):
         if camera != frame.camera:

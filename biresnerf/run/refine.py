@@ -46,8 +46,8 @@ def refine(
         output: a folder that is empty, new, or holds an unfinished run of the same input and options.
         progress: True draws one bar over the whole run, with the time left: in notebooks, too; lines where there is
             neither a notebook nor a terminal. A function is called with a `Progress` a few times a second.
-        should_stop: asked after every step, view, frame and photo; once true, a checkpoint and a partial result are
-            written. Without it, Ctrl-C asks for the same, as does a notebook's stop button.
+        should_stop: called after every step, view, frame and photo; once true, a checkpoint and a partial result are
+            written. Without it, Ctrl-C or a notebook's stop button does the same.
         fixed_from: a finished result of some of the photos: these keep its poses and lenses, and the others join them.
         overwrite: remove a finished result from `output` first.
         method: the option of that name, or a method of your own (docs/method.md).
@@ -60,8 +60,8 @@ def refine(
         InputError: the user can fix it: ``invalid_options`` with the nearest name of a wrong one, or a code of
             docs/troubleshooting.md. Those of input, output and options come before torch is loaded.
         RefinementError: the optimisation diverged.
-        Interrupted: stopped on request; the checkpoint and a partial result are in `output`, or nothing yet where
-            initial poses were still being looked for.
+        Interrupted: stopped on request; the checkpoint and a partial result are in `output`, or nothing yet if initial
+            poses were still being computed.
     """
     let_waiting_threads_sleep()
     own = None if isinstance(method, str) else method

@@ -24,7 +24,7 @@ from biresnerf.write.output_folder import GEOREFERENCE
 def write_georeference(
     dataset: Dataset, world_from_cam: NDArray[np.float64], folder: Path
 ) -> GeoReference | None:
-    """Fit the returned poses [n, 4, 4] to the measured positions, and write georeference.json where these tell a frame.
+    """Fit the returned poses [n, 4, 4] to the measured positions, and write georeference.json where these fix a frame.
 
     Returns what the report says of it; None without measured positions.
 

@@ -21,7 +21,7 @@ RENDERS, ORBIT = "renders", "renders/orbit.mp4"
 
 
 class OutputFolder:
-    """Refuses folders that hold something else.
+    """The folder of one run. Refuses folders that hold something else.
 
     Args:
         keep_reusable: leave behind what other runs of the set can start from.
@@ -87,7 +87,7 @@ class OutputFolder:
     def clean_up(self, *, failed: bool = False) -> None:
         """Remove what only an unfinished run needs, and what others could start from unless that is to be kept.
 
-        What COLMAP said stays where something ``failed``.
+        COLMAP's log is kept if something ``failed``.
         """
         if failed and (said := self.path / CHECKPOINT.with_name(LOG)).is_file():
             said.replace(self.path / LOG)

@@ -92,7 +92,7 @@ class SeedingPreview:
             self._folder.remove_preview()
 
     def __call__(self, found: SeedingProgress) -> None:
-        """More is known."""
+        """Show what is known by now."""
         self._found = found
         self._forecast(found)
         given = self._dataset.posed.all()

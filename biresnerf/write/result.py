@@ -57,7 +57,7 @@ def write_result(
     result is complete, what only an unfinished run needs is removed.
 
     Args:
-        so_far: what a run offers that has no verdict yet; the present poses if not given.
+        so_far: the best poses of a run that has no verdict yet; by default the present poses.
 
     Returns the report with notes on what was written.
 
@@ -116,7 +116,7 @@ class ResultPictures:
         self._folder, self._scene = folder.path, scene
 
     def write_view(self, score: ViewScore) -> ShownView:
-        """Render, photo, difference and depth of one view."""
+        """Write render, photo, difference and depth of one view."""
         photo = self._scene.images.image(score.image)
         stem = picture_stems(self._scene.dataset.names)[score.image]
         files = write_rendered(self._folder / RENDERS, stem, score.view, photo)
@@ -131,7 +131,7 @@ class ResultPictures:
         )
 
     def write_before_after(self, views: Sequence[ShownView], renders: BeforeAfter) -> list[ShownView]:
-        """The shown views, with what the verdict's two trainings make of them."""
+        """Write the shown views as the verdict's two trainings render them."""
         stems, shown = picture_stems(self._scene.dataset.names), []
         for view in views:
             if view.image in renders:
@@ -149,7 +149,7 @@ class ResultPictures:
 
 
 def write_rendered(folder: Path, stem: str, view: RenderedView, photo: NDArray[np.generic]) -> list[Path]:
-    """The pictures of a rendered view beside its photo [h, w, 3]; depth is left out where nothing solid is seen."""
+    """Write a rendered view beside its photo [h, w, 3]; depth is left out where nothing solid is seen."""
     depth = np.where(view.opacity > SOLID, view.depth, np.nan)
     return write_view(folder, stem, render=view.colour, photo=photo, depth=depth)
 
@@ -173,9 +173,9 @@ def described(
 
 
 def _body_offset(dataset: Dataset, world_from_cam: NDArray[np.float64], report: Report) -> BodyOffset | None:
-    """What these poses have and those of the body do not; None where none was found, or the views are a panorama's.
+    """The offset between the body and these poses; None where none was found, or for views of a panorama.
 
-    The input's own poses had taken back what the first comparison with matches found; the adjustment tells more.
+    The first comparison with matches already removed one from the input's poses; the adjustment finds a better one.
     """
     said = report.input_accuracy
     if dataset.cut is not None:
@@ -202,7 +202,7 @@ def _write_poses(
 ) -> tuple[Report, RefinedSet]:
     """Write poses [n, 4, 4] in the formats of every result, in the input's own and in the exports.
 
-    ``dataset`` is the input, with the refined lenses where those are returned; ``field`` are points for where no
+    ``dataset`` is the input, with the refined lenses where those are returned; ``field`` are points to use where no
     others are known.
 
     Returns the report with notes on them, and the set as written.
