@@ -1,1 +1,1 @@
-"""HTTP in and out, and the web page. Never loads torch or pycolmap."""
+"""The HTTP service and the web page. Never loads torch or pycolmap."""

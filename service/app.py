@@ -1,4 +1,4 @@
-"""The web application: its routes, the engine for its lifetime, and a problem for every error."""
+"""The web application: its routes, the engine while it runs, and a problem response for every error."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ from workers.settings.traces import flush_traces
 logger = logging.getLogger(__name__)
 
 _UNFINISHED_EVERY_S = 15.0
-_BROKEN_S = 30.0  # probes of /livez see it first
+_BROKEN_S = 30.0  # long enough for a probe of /livez to see it
 _RESOURCES = (
     datasets,
     photos,
@@ -85,7 +85,7 @@ Every error is `application/problem+json` (RFC 9457) with a stable `code`.
 
 
 def create_app(settings: Settings) -> FastAPI:
-    """The application; opens the engine when it starts (needs ``settings.database_url``, migrated)."""
+    """The application; opens the engine when it starts (needs ``settings.database_url`` of a migrated database)."""
     metrics = WebMetrics()
 
     @asynccontextmanager
@@ -97,7 +97,7 @@ def create_app(settings: Settings) -> FastAPI:
             if swept:
                 logger.info("removed %d unfinished uploads", swept)
             service.keep_running(_repeat(finish_checks, service, _UNFINISHED_EVERY_S))
-            # Those that a dispatcher fetched as well, for which somebody may wait.
+            # Uploads that a dispatcher fetched, too; a client may be waiting for them.
             service.keep_running(_repeat(finish_uploads, service, settings.poll_s))
             # Workers do the same; without any, trash and tallies would pile up.
             service.keep_running(stores.janitor.run())
@@ -128,7 +128,7 @@ def create_app(settings: Settings) -> FastAPI:
     )
     app.add_middleware(Access, settings=settings)
     app.add_middleware(HeadAnswers, methods_at=_methods_at)
-    app.add_middleware(RequestContext)  # it responds to what Access refuses
+    app.add_middleware(RequestContext)  # renders what Access refuses
     app.add_middleware(Observed, metrics=metrics)
     _answer_with_problems(app)
     for router in _ROUTERS:
@@ -144,7 +144,7 @@ def _operation_id(route: APIRoute) -> str:
 
 
 async def _repeat(work: Callable[[Service], Awaitable[None]], service: Service, pause_s: float) -> None:
-    """Does the work now and again, whatever happens to it."""
+    """Repeats the work forever, also after it failed."""
     while True:
         try:
             await work(service)
@@ -156,7 +156,7 @@ async def _repeat(work: Callable[[Service], Awaitable[None]], service: Service, 
 
 
 async def _stop_if_broken(service: Service) -> None:
-    """Stops the process once it lost its connections to the database, for what restarts only processes that ended."""
+    """Stops the process once its database connections are lost: only an ended process is restarted."""
     await service.stores.monitor.broken.wait()
     await asyncio.sleep(_BROKEN_S)
     signal.raise_signal(signal.SIGTERM)
@@ -167,7 +167,7 @@ async def finish_checks(service: Service) -> None:
     for dataset_id in await service.stores.datasets.unfinished():
         try:
             await service.stores.datasets.check(dataset_id)
-        except (FaultError, OSError) as error:  # of this one, which may be deleted by now; others may do well
+        except (FaultError, OSError) as error:  # deleted meanwhile, for example; go on with others
             logger.warning("dataset %s is not checked yet: %s", dataset_id, error)
 
 
@@ -176,7 +176,7 @@ async def finish_uploads(service: Service) -> None:
     for upload_id in await service.stores.uploads.not_imported():
         try:
             await import_upload(service, upload_id)
-        except (FaultError, OSError) as error:  # of this one; others may do well
+        except (FaultError, OSError) as error:  # go on with others
             logger.warning("upload %s is received but not stored yet: %s", upload_id, error)
     await service.stores.uploads.expire()
 
@@ -225,11 +225,11 @@ def _from_http_exception(error: HTTPException) -> ProblemError:
 
 
 class _AnsweredError(Exception):
-    """The headers are out: what makes the body, perhaps without end, stops here."""
+    """Raised once the headers are sent, to stop a body that may never end."""
 
 
 class HeadAnswers:
-    """ASGI middleware around all routes; those that serve HEAD themselves do so."""
+    """ASGI middleware that answers HEAD by GET, except for routes that handle HEAD themselves."""
 
     def __init__(self, app: ASGIApp, methods_at: Callable[[str], Sequence[str]]) -> None:
         self._app, self._methods_at = app, methods_at
@@ -252,7 +252,7 @@ class HeadAnswers:
         scope["method"] = "GET"
         try:
             await self._app(scope, receive, send_head)
-        except Exception:  # ours, perhaps in a group
+        except Exception:  # an _AnsweredError, possibly in a group
             if not answered:
                 raise
         finally:

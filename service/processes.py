@@ -1,6 +1,6 @@
 """Web processes that share one listening socket, which their parent holds.
 
-While one of them is replaced, the others accept; where there is one alone, clients wait in the socket's queue.
+While one is replaced, the others accept connections; if there is only one, clients wait in the socket's backlog.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class WebProcesses:
 
 
 def listen(settings: Settings) -> socket.socket:
-    """The bound socket; raises `SetupError` where the address cannot be had."""
+    """The bound socket; raises `SetupError` if the address is not available."""
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
     bound = socket.socket(family, socket.SOCK_STREAM)
     bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -47,11 +47,11 @@ def listen(settings: Settings) -> socket.socket:
 
 @contextmanager
 def web_processes(settings: Settings) -> Iterator[WebProcesses]:
-    """What the supervisor starts, while the context holds the socket and the counters; raises `SetupError`."""
+    """The processes for the supervisor, with their socket and counters held meanwhile; raises `SetupError`."""
     with ExitStack() as held:
         bound = held.enter_context(listen(settings))
         port = bound.getsockname()[1]
-        # Who needs a key depends on the address.
+        # The address decides whether a key is needed.
         variables = {"BIRESNERF_HOST": settings.host, "BIRESNERF_PORT": str(port)}
         if settings.processes > 1:
             folder = held.enter_context(

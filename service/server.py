@@ -1,6 +1,6 @@
 """The web process: `python -m service.server`, settings from the environment.
 
-The supervisor of several gives each the socket they share (`service.processes`).
+If there are several, the supervisor gives them a shared socket (`service.processes`).
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from workers.settings.traces import set_up_traces
 logger = logging.getLogger(__name__)
 # Long downloads may use it; event streams end at once (see `_Server`).
 _SHUTDOWN_GRACE_S = 5
-# For clients that send one request after the other: their next response says that the connection ends.
+# For clients with sequential requests: their next response announces the end of the connection.
 FAREWELL_S = 1.0
 # Longer than proxies keep idle connections, which would otherwise send into one that we are closing.
 KEEP_ALIVE_S = 75
 
 
 class _Server(uvicorn.Server):
-    """Ends event streams when asked to stop, for which uvicorn alone would wait, and no connection in mid request."""
+    """Ends event streams on shutdown, which uvicorn would wait for, but no connection in mid-request."""
 
     def __init__(self, config: uvicorn.Config, app: FastAPI) -> None:
         super().__init__(config)
@@ -49,7 +49,7 @@ class _Server(uvicorn.Server):
         super().handle_exit(sig, frame)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Leaves the socket to others, and lets idle connections end with their next response.
+        """Stops accepting connections, and lets idle ones end with their next response.
 
         Closed at once, they would lose the requests that are on their way.
         """
@@ -66,7 +66,7 @@ class _Server(uvicorn.Server):
 
 
 def serve(settings: Settings, bound: socket.socket | None = None) -> None:
-    """Serves until SIGINT or SIGTERM, on the socket that the parent bound or else on one of its own.
+    """Serves until SIGINT or SIGTERM, on the parent's bound socket or else on a new one.
 
     Raises `SetupError`.
     """

@@ -58,7 +58,7 @@ def up_command(
     from workers.settings.logs import set_up_logging
     from workers.upkeep.supervise import dispatcher_spec, slot_specs, supervise
 
-    os.environ.setdefault("BIRESNERF_LOG_LEVEL", "INFO" if verbose else "WARNING")  # of the children, too
+    os.environ.setdefault("BIRESNERF_LOG_LEVEL", "INFO" if verbose else "WARNING")  # for children, too
     if open_page is None:
         open_page = sys.stdout.isatty() and ("DISPLAY" in os.environ or sys.platform == "darwin")
     with setup_problems():
@@ -132,9 +132,9 @@ def worker_command(
 ) -> None:
     """Run one worker slot, which runs one job at a time.
 
-    Needs BIRESNERF_DATABASE_URL, and a database brought up to date by `biresnerf migrate`. Where CUDA_VISIBLE_DEVICES
-    is set, jobs of a --free-slot gpu get that device, as batch systems give it. With --one-job the exit
-    status says how the job ended, or that there was none; docs/operations.md lists the statuses.
+    Needs BIRESNERF_DATABASE_URL, and a database brought up to date by `biresnerf migrate`. With --free-slot gpu, jobs
+    use the device in CUDA_VISIBLE_DEVICES if it is set, as batch systems do. With --one-job the exit status says how
+    the job ended, or that there was none; docs/operations.md lists the statuses.
     """
     from workers.queue.slot import run_slot
 

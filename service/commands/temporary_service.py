@@ -22,7 +22,7 @@ _READY = re.compile(r"ready at (\S+)")
 
 @contextmanager
 def temporary_service() -> Iterator[str]:
-    """The address of a `biresnerf up` with default settings; it and its files are gone at the end.
+    """Yields the address of a temporary `biresnerf up` with default settings; deletes its files at the end.
 
     Raises:
         BiresnerfError: it did not start; the message ends with its log.

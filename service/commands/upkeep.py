@@ -68,7 +68,7 @@ def restore_command(folder: Path, data_dir: Path | None, as_json: bool) -> None:
 
     with setup_problems():
         settings = settings_with(data_dir=data_dir)
-        read_index(folder)  # raises before a database is created
+        read_index(folder)  # check the backup before a database is created
         with reached_database(settings, migrated=False) as url:
             index = asyncio.run(restore_backup(settings, url, folder))
     _show_backup(index, as_json)

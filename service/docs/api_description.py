@@ -1,4 +1,4 @@
-"""What FastAPI cannot know of the interface: problems in their own media type, links, and examples."""
+"""Completes FastAPI's OpenAPI document: the media type of problems, links, and examples."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An example of any model, made of the examples of its fields; a model whose example is wrong raises."""
+"""Builds an example of any model from the examples of its fields; raises if the model refuses it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 
 
 def example_of(model: type[BaseModel]) -> dict[str, Any]:
-    """The JSON of a whole ``model``: its defaults, the examples of its fields, and models inside it likewise.
+    """An example of ``model`` as JSON: defaults and examples of its fields, and of nested models.
 
     Raises:
         LookupError: a required field has no example, and its type alone suggests none.
@@ -29,7 +29,7 @@ def example_of(model: type[BaseModel]) -> dict[str, Any]:
 
 
 def _is_shown(field: FieldInfo) -> bool:
-    """Whether the example says more than the field's default; of a model inside it always does."""
+    """Whether to show an example in place of the field's default; a nested model always gets one."""
     composed = field.default_factory is None and _has_model(field.annotation)
     return bool(field.examples) or field.is_required() or composed
 

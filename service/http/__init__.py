@@ -1,1 +1,1 @@
-"""HTTP for every route alike: access, limits, errors, logs and metrics of requests."""
+"""What all routes share: access, limits, errors, request logs and metrics."""

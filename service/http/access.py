@@ -58,17 +58,17 @@ _CHALLENGE = 'Bearer realm="biresnerf"'
 
 @dataclass(frozen=True)
 class RateLimit:
-    """At most ``burst`` requests of one client at once, and ``rate`` a second on average, in all web processes."""
+    """Per client, over all web processes: at most ``burst`` requests at once, ``rate`` a second on average."""
 
     policy: str
     rate: float
     burst: int
 
     async def take(self, request: Request, client: str) -> dict[str, str]:
-        """Counts a request, and says what is left by the headers of draft-ietf-httpapi-ratelimit-headers.
+        """Counts a request; returns the headers of draft-ietf-httpapi-ratelimit-headers.
 
         Raises:
-            ProblemError: ``rate_limited``: the request is one too many.
+            ProblemError: ``rate_limited``: the request exceeds the limit.
             Unavailable: the database does not answer.
         """
         level = await service_of(request).stores.buckets.take(self.policy, client, self.rate, self.burst)
@@ -90,7 +90,7 @@ class RateLimit:
 class Identity:
     """The tenant and the scopes of a request. ``key_id`` is None where no key is needed.
 
-    ``link`` is that of the request, which then reads one job alone.
+    ``link`` is set for a request by link, which can read only one job.
     """
 
     tenant: str
@@ -103,7 +103,7 @@ class Identity:
 class Caller:
     """The identified client of a request, with the stores limited to its tenant.
 
-    ``client`` is what limits are counted by: the key, or the address without one; None on loopback.
+    Limits are counted per ``client``: the key, or without one the address; None on loopback.
     """
 
     service: Service
@@ -156,7 +156,7 @@ class Access:
         await self._app(scope, receive, send_with_headers)
 
     async def _left(self, request: Request) -> dict[str, str]:
-        """What the client, who is identified here, has left, as headers; none where it has no limit."""
+        """Identifies the client and counts its request; returns rate-limit headers, none where it has no limit."""
         request.state.identity = identity = await self._identified(request)
         anonymous = None if on_loopback(self._settings.host) else _address(request)
         request.state.client = client = identity.key_id or anonymous
@@ -214,7 +214,7 @@ async def _anonymous(service: Service, request: Request) -> Identity:
             headers={"WWW-Authenticate": _CHALLENGE},
         )
     if service.settings.auth == "auto" and is_public_name(request.url.hostname or ""):
-        # DNS rebinding: a page's own host name may resolve to this machine, and would then be of the same site.
+        # DNS rebinding: a page's own host name may resolve to this machine and then count as same-site.
         raise ProblemError(
             "cross_site",
             "Without an API key only requests to this machine by its own name are accepted.",
@@ -265,7 +265,7 @@ async def may_scrape(service: Service, request: Request) -> bool:
 
 
 async def _scopes(service: Service, request: Request) -> frozenset[KeyScope]:
-    """Those of the request; none where it would be refused."""
+    """The scopes of the request; none if it would be refused."""
     try:
         return (await identify(service, request)).scopes
     except ProblemError:

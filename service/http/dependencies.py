@@ -25,21 +25,21 @@ from workers.process.turns import Turns
 from workers.settings.settings import Settings
 
 Listing = TypeVar("Listing", bound=BaseModel)
-# Bodies as they came; their values take about ten times as much, one body after the other.
+# Of raw bodies. Parsed values take about ten times as much, but bodies are parsed one at a time.
 JSON_BYTES_AT_ONCE = 32 * 2**20
-JSON_FREE_BYTES = 64 * 2**10  # of each body, not counted: usual requests pass whoever sends large ones
+JSON_FREE_BYTES = 64 * 2**10  # free for each body: ordinary requests pass while others send large ones
 _ID = re.compile(r"^[a-z]{2,3}_[0-9A-Za-z]{1,40}$", re.ASCII)
 
 
 class Held:
-    """What clients hold of something at once, counted by each web process alone.
+    """Limits how much of a resource clients hold at once; each web process counts its own.
 
     Args:
-        what: it is, in the plural.
-        each: how much one client may hold; 0 is no limit.
-        in_all: how much all may hold together.
+        what: the resource, in the plural.
+        each: the most that one client may hold; 0 is no limit.
+        in_all: the most that all may hold together; 0 is no limit.
 
-    Who holds nothing beside it may hold one thing larger than that.
+    A single item may exceed a limit while nothing else is held.
     """
 
     def __init__(self, what: str, *, each: int, in_all: int = 0) -> None:
@@ -48,9 +48,9 @@ class Held:
 
     @contextmanager
     def counted(self, client: str | None, amount: int = 0) -> Iterator[Callable[[int], None]]:
-        """Counts one thing while the context lasts; tell the function how much it is by now.
+        """Counts one item while the context lasts; call the yielded function with its current amount.
 
-        Both raise ``ProblemError`` (``too_many_uploads``). Without a client only what all hold is limited.
+        Both raise ``ProblemError`` (``too_many_uploads``). Without a client, only the total is limited.
         """
         mine = 0
 

@@ -1,18 +1,18 @@
-"""Whose a host name or address is: this machine's alone, or one that others control."""
+"""Classifies host names and addresses: loopback, or controlled by others."""
 
 from __future__ import annotations
 
 import ipaddress
 import re
 
-# Labels as in names of machines and containers; RFC 1123 has no underscore, Compose has.
+# Labels of host and container names; RFC 1123 forbids the underscore, Compose uses it.
 _LABEL = r"[A-Za-z0-9](?:[\w-]{0,61}[A-Za-z0-9])?"
 _NAME = re.compile(rf"{_LABEL}(?:\.{_LABEL})*\.?", re.ASCII)
 _PLACE = re.compile(r"(\[[^]]*\]|[^:\[\]]*)(?::[0-9]{1,5})?", re.ASCII)
 
 
 def is_host(text: str) -> bool:
-    """Whether a Host header names a machine: by a name or an IP address, and perhaps a port."""
+    """Whether a Host header is valid: a name or an IP address, with or without a port."""
     place = _PLACE.fullmatch(text)
     if place is None or len(text) > 260:
         return False
@@ -20,7 +20,7 @@ def is_host(text: str) -> bool:
     try:
         if host.startswith("["):
             return ipaddress.ip_address(host[1:-1]).version == 6
-        if host.rstrip(".").rpartition(".")[2].isdigit():  # no name ends so, and browsers write addresses out
+        if host.rstrip(".").rpartition(".")[2].isdigit():  # no top-level domain is a number
             return ipaddress.ip_address(host).version == 4
     except ValueError:
         return False
@@ -28,7 +28,7 @@ def is_host(text: str) -> bool:
 
 
 def on_loopback(host: str) -> bool:
-    """Whether the address or name is this machine's alone."""
+    """Whether the address or name is a loopback one."""
     if host == "localhost":
         return True
     try:

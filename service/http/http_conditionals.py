@@ -29,7 +29,7 @@ def byte_range(header: str | None, if_range: str | None, etag: str, size: int) -
     A range of another unit, several ranges and a stale `If-Range` get the whole file, as the RFC allows.
 
     Raises:
-        ProblemError: ``bad_range`` (400) where the header makes no sense; ``range_not_satisfiable`` (416).
+        ProblemError: ``bad_range`` (400) if the header is malformed; ``range_not_satisfiable`` (416).
     """
     if header is None or not header.strip().lower().startswith("bytes="):
         return None

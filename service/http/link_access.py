@@ -1,4 +1,4 @@
-"""What a link to a job's page opens: that job to read, without its log and its owner's names, and nothing else."""
+"""What a link to a job's page opens: reading that job, without its log and its owner's names."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _SHOWN = re.compile(r"(/(artifacts|artifacts/(?!log\.txt$).+|report|link))?", re
 
 
 def require_shown(job_id: str, method: str, path: str) -> None:
-    """Raises ``ProblemError`` (``not_found``) unless a link to the job opens this."""
+    """Raises ``ProblemError`` (``not_found``) unless a link to the job allows this request."""
     base = f"/v1/jobs/{job_id}"
     shown = path.startswith(base) and _SHOWN.fullmatch(path[len(base) :])
     if method not in ("GET", "HEAD") or not shown:

@@ -2,9 +2,9 @@
 
 Requests and streams are counted by the web processes of one port (`collected`), which is one scrape target.
 prometheus_client keeps their counters in files that all of them read (`PROMETHEUS_MULTIPROC_DIR`, set by
-`service.processes`). Counters of ended processes stay, gauges go.
+`service.processes`). Counters of ended processes are kept, their gauges dropped.
 Queue, jobs, stages and slots belong to the whole installation and are read from the database at each scrape; every
-replica reports the same, and workers need no port of their own.
+replica reports the same, and workers need no port.
 """
 
 from __future__ import annotations
@@ -180,7 +180,7 @@ def _histogram(
         mine = [item for item in tallies if item["label"] == value]
         counts = {item["bucket"]: item["count"] for item in mine}
         buckets, below = [], 0
-        # A duration in bucket i is less than bound i; those beyond the last bound are in one bucket more.
+        # A duration in bucket i is less than bound i; one more bucket has those beyond the last bound.
         for index, bound in enumerate((*bounds_s, float("inf"))):
             below += counts.get(index, 0)
             buckets.append(("+Inf" if bound == float("inf") else f"{bound:g}", float(below)))
@@ -188,19 +188,19 @@ def _histogram(
     return family
 
 
-# Of gauges: the sum over living processes.
+# Gauges are summed over living processes.
 LIVING: Literal["livesum"] = "livesum"
 
 
 def forget_predecessor() -> None:
-    """Before the first metric is made: a process may get the number of one that ended."""
+    """Call it before the first metric is made: this process may have the PID of one that ended."""
     folder = os.environ.get(COUNTERS_VARIABLE)
     if folder:
         mark_process_dead(os.getpid(), folder)
 
 
 def collected(registry: CollectorRegistry) -> Iterable[Metric]:
-    """The metrics of this process, or of all that share its port; then those of the system have a label `pid`."""
+    """The metrics of this process, or of all that share its port; system metrics then have a label `pid`."""
     folder = os.environ.get(COUNTERS_VARIABLE)
     if not folder:
         return [*registry.collect(), *ProcessCollector(registry=None).collect()]

@@ -97,14 +97,14 @@ class RequestContext:
 
 
 def _refuse_ambiguous(request: Request) -> None:
-    """Refuse what the parser accepts but a proxy before us may have read differently."""
+    """Refuse requests that the parser accepts but a proxy in front of us may have parsed differently."""
     close = {"Connection": "close"}
     if request.scope["http_version"] not in {"1.0", "1.1"}:
         raise ProblemError("malformed_request", "This is not HTTP/1.", headers=close)
     if "content-length" in request.headers and "transfer-encoding" in request.headers:
         detail = "Content-Length and Transfer-Encoding exclude each other."
         raise ProblemError("malformed_request", detail, headers=close)
-    # Where it cannot be parsed, the framework takes the server's own address for it.
+    # The framework would replace a Host that it cannot parse by the server's own address.
     host = request.headers.get("host")
     if host is not None and not is_host(host):
         raise ProblemError(
@@ -125,10 +125,10 @@ def _refuse_ambiguous(request: Request) -> None:
 
 
 def _refuse_other_pages(request: Request) -> None:
-    """Refuse what pages of other origins send: a browser would send their forms to a service on this machine.
+    """Refuse requests from pages of other origins: browsers would send their forms to a local service.
 
-    Browsers say so in Sec-Fetch-Site; those that do not, or not over plain HTTP, say where a page is from. Another port
-    of the same machine is another origin.
+    Browsers without Sec-Fetch-Site, or that leave it out over plain HTTP, send Origin. Another port of the same machine
+    is another origin.
     """
     if request.method in _SAFE:
         return
@@ -141,7 +141,7 @@ def _refuse_other_pages(request: Request) -> None:
 
 
 def _is_own(origin: str, request: Request) -> bool:
-    """Whether it is of this host, and no less safe than the request: a proxy before us may be the one that has TLS."""
+    """Whether the origin is this host, by HTTPS or the request's scheme: a proxy may have ended TLS."""
     try:
         page = urlsplit(origin)
     except ValueError:

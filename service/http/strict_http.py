@@ -26,7 +26,7 @@ _TOO_LARGE = 431
 
 
 class _StrictHeads(h11.Connection):
-    """Refuses request heads that `_Head` refuses, which reads each line once, however it arrives."""
+    """Refuses request heads that `_Head` refuses. Each line is read once, however it arrives."""
 
     _head: _Head | None = None
 
@@ -44,9 +44,9 @@ class _StrictHeads(h11.Connection):
 class _Head:
     """The lines of a request's head, as they arrive.
 
-    Refused is what another program on the way may read differently, though RFC 9112 lets us take it: lines that end
-    without a carriage return (section 2.2), headers that go on in the next line (5.2), and a length that is given
-    twice, even if equal (6.3); and more headers than anybody needs.
+    Refuses what RFC 9112 allows but proxies may parse differently: lines that end without a carriage return (section
+    2.2), headers continued on the next line (5.2), and a repeated length, even if equal (6.3). Refuses too many headers
+    as well.
     """
 
     def __init__(self) -> None:
@@ -54,7 +54,7 @@ class _Head:
         self._lengths = self._line_at = self._searched = 0
 
     def read(self, received: bytes) -> None:
-        """Read on in all that was received so far. Raises `h11.RemoteProtocolError`."""
+        """Continue in ``received``, all bytes so far. Raises `h11.RemoteProtocolError`."""
         while (end := received.find(b"\n", self._searched)) >= 0:
             line = received[self._line_at : end]
             self._line_at = self._searched = end + 1
@@ -110,7 +110,7 @@ class StrictHttp(H11Protocol):
         )
 
     def resume_writing(self) -> None:
-        """The client reads again."""
+        """Stops the time limit: the client reads again."""
         super().resume_writing()
         _stop(self._reader_timer)
         self._reader_timer = None

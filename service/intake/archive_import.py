@@ -27,7 +27,7 @@ from workers.store.measured_stream import MeasuredStream
 logger = logging.getLogger(__name__)
 
 RATIO_MAX = 200.0
-# Between two looks at an upload that another process stores, and at those that are being fetched.
+# Poll intervals: of an upload that another process stores, and of those that are being fetched.
 _POLL_S, _FETCH_POLL_S = 0.3, 1.0
 # A folder of this name is part of the dataset, even if it is the only one in the archive.
 _KEPT_FOLDERS = {"images"}
@@ -36,12 +36,12 @@ _KEPT_FOLDERS = {"images"}
 async def import_archive(
     service: Service, dataset_id: str, archive: Path, upload_id: str | None = None
 ) -> DatasetView:
-    """Unpacks ``archive``, which is alone in a staging folder, in a child process; then stores what came out.
+    """Unpacks ``archive``, alone in its staging folder, in a child process; then stores all files, or none.
 
-    ``upload_id``: the upload that it came by. All of its files are added, or none. Closing the dataset waits.
+    ``upload_id``: the upload that brought the archive. Finalizing the dataset waits for the import.
 
     Raises:
-        ProblemError: what is wrong with the archive, and with which entry.
+        ProblemError: the archive's fault; names the entry.
     """
     datasets = service.stores.datasets
     async with datasets.importing(dataset_id):
@@ -53,7 +53,7 @@ async def import_archive(
 
 
 async def _unpacked(service: Service, dataset_id: str, archive: Path, upload_id: str | None) -> Path:
-    """The folder of what the archive holds."""
+    """The folder with the archive's content."""
     settings = service.settings
     dataset = await service.stores.datasets.get(dataset_id)
     if dataset.state != "open":
@@ -61,7 +61,7 @@ async def _unpacked(service: Service, dataset_id: str, archive: Path, upload_id:
             "dataset_not_open", f"The dataset is {dataset.state}.", hint="Create a new dataset."
         )
     allowed = min(settings.max_unpacked_bytes, settings.max_dataset_bytes - dataset.bytes)
-    # Twice: unpacked here, and then stored, which may be on the same disk.
+    # Half: files are unpacked here and then stored, possibly on the same disk.
     room = await asyncio.to_thread(service.disk_budget.free_bytes) // 2
     into = archive.parent / "content"
     into.mkdir()
@@ -130,14 +130,14 @@ async def import_upload(service: Service, upload_id: str) -> None:
     except BaseException as error:
         failure = _client_error(error) if isinstance(error, FaultError) else None
         if failure is None:
-            # This process may just be stopping: then another takes the upload at once.
+            # If this process is only stopping, another takes the upload at once.
             await uploads.give_back(upload_id, token, failed=isinstance(error, Exception))
             raise
     await retry_while_unavailable(lambda: uploads.conclude(upload_id, token, failure))
 
 
 def _client_error(error: FaultError) -> JobError | None:
-    """The upload's error where sending the same again would fail again; None where the service is at fault."""
+    """The upload's error if sending it again would fail again; None if the service is at fault."""
     problem = problem_of(error)
     service_at_fault = problem.status >= 500 or (problem.retryable and problem.code != "quota_exhausted")
     return None if service_at_fault else JobError(**dict(problem.fault))
@@ -159,10 +159,10 @@ async def _add_to_dataset(service: Service, upload: Upload) -> None:
 
 
 async def import_received(service: Service, dataset_id: str) -> None:
-    """Waits until everything received is in the dataset: what other requests have just sent, what is being fetched.
+    """Waits until all uploads are in the dataset: those received by other requests and those being fetched.
 
     Raises:
-        ProblemError: ``dataset_not_complete`` where an upload is unfinished; what was wrong with another.
+        ProblemError: ``dataset_not_complete`` if an upload is unfinished; the error of one that failed.
     """
     while True:
         pending = await service.stores.uploads.of_dataset(dataset_id)

@@ -1,4 +1,4 @@
-"""Closing a dataset: its files are frozen, and a check begun and waited for."""
+"""Finalizes a dataset: freezes its files, starts the check, and waits for it."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from service.intake.archive_import import import_received
 
 
 async def begin_check(caller: Caller, dataset_id: str) -> DatasetView:
-    """Freezes the dataset and starts its check, which goes on when the client is gone.
+    """Freezes the dataset and starts its check, which continues if the client disconnects.
 
     Raises:
         ProblemError: ``name_collision``; then the dataset stays open.
     """
     store = caller.datasets
-    await store.get(dataset_id)  # the caller's own, before anything is done to it
+    await store.get(dataset_id)  # raises unless it is the caller's own
     await import_received(caller.service, dataset_id)
     names, cursor = NameSet(), None
     while True:

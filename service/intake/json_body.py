@@ -54,7 +54,7 @@ class _ReadRequest(Request):
 
 @asynccontextmanager
 async def read_json(request: Request, limit: int = JSON_BYTES_MAX) -> AsyncIterator[Any]:
-    """The values of the body, which has ``limit`` bytes at most and counts while the context lasts.
+    """The values of a body of at most ``limit`` bytes; it counts against the limits while the context lasts.
 
     Raises:
         ProblemError: ``unsupported_media``, ``body_too_large``, ``too_many_uploads``, ``malformed_json``.

@@ -22,7 +22,7 @@ from service.intake.uploads import limited_body
 from workers.process.locked_folders import locked_folder
 from workers.settings.errors import EngineError
 
-# For the text fields and the delimiters of the form; of one text field.
+# Limits of all text fields with the form's delimiters, and of one text field.
 _FORM_BYTES, _TEXT_BYTES = 2**20, 2**18
 TEXTS = tuple(JobTexts.model_fields)
 # Plain text; the other text fields are JSON.
@@ -31,7 +31,7 @@ ARCHIVE = "archive"
 
 
 class _FormParser(MultiPartParser):
-    """Writes the file of a form to ``target``; the base class takes the folder for temporary files, which is small."""
+    """Writes the form's file to ``target``; the base class uses the temporary folder, which may be small."""
 
     def __init__(self, content_type: str, body: AsyncGenerator[bytes, None], target: Path) -> None:
         headers = Headers({"content-type": content_type})
@@ -49,7 +49,7 @@ class _FormParser(MultiPartParser):
 
 
 async def read_form(content_type: str, body: AsyncGenerator[bytes, None], target: Path) -> dict[str, str]:
-    """The texts of a form, whose archive goes to ``target``.
+    """The text fields of a form; writes its archive to ``target``.
 
     Raises:
         ProblemError: ``malformed_body``; ``invalid_request``: a field is unknown, repeated or no text, or there is no
@@ -77,7 +77,7 @@ async def read_form(content_type: str, body: AsyncGenerator[bytes, None], target
 
 
 async def submit_form(caller: Caller, request: Request, idempotency_key: str | None) -> tuple[JobView, bool]:
-    """Submits the form: `archive`, and the texts as JSON but for those of `PLAIN`.
+    """Submits the form: `archive`, and text fields, which hold JSON except those of `PLAIN`.
 
     Returns the job and whether it is new. A repeated request with the same key is recognised by the archive's digest,
     before anything is unpacked. If the job cannot be submitted, its dataset is deleted. Needs the scope

@@ -1,6 +1,6 @@
 """One photo of a checked dataset, or its mask, as a picture for pages.
 
-It is made when it is asked for, in a child program: `python -m service.intake.photo_pictures`.
+A child program draws it on request: `python -m service.intake.photo_pictures`.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from workers.settings.errors import NotFound
 PictureName = Literal["picture.jpg", "mask.png"]
 LONG_SIDE_PX = 1280
 _FILES = "files"
-_QUALITY = 92  # of JPEG, with colours as fine as brightness: areas are chosen by them
+_QUALITY = 92  # of JPEG without chroma subsampling: areas are selected by colour
 _SECONDS, _FILE_BYTES = 60.0, 16 * 2**20
 
 
 class DrawRequest(FrozenModel):
-    """What to draw, and the folder for it, which has the photo's files at their paths below ``files``."""
+    """What to draw, and the folder for it; its ``files`` holds the photo's files at their paths."""
 
     folder: Path
     photo: CheckedPhoto
@@ -38,7 +38,7 @@ class DrawRequest(FrozenModel):
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture that can be drawn, of files that are not read before it is."""
+    """A picture that is drawn on demand; its files are not read before."""
 
     files: tuple[DatasetFile, ...]
     photo: CheckedPhoto
@@ -47,7 +47,7 @@ class Picture:
 
     @property
     def etag(self) -> str:
-        """Differs where the picture may: with the files, what is drawn of them, or the version that draws."""
+        """Changes with the files, with what is drawn of them, and with the program's version."""
         sources = [file.sha256 for file in self.files]
         drawn = [self.photo.model_dump_json(), self.camera.model_dump_json(), self.name, __version__]
         return f'"{hashlib.sha256(json.dumps(sources + drawn).encode()).hexdigest()[:32]}"'
@@ -66,7 +66,7 @@ class Picture:
 
 
 async def photo_picture(caller: Caller, dataset_id: str, number: int, name: PictureName) -> Picture:
-    """The photo of that number, turned as its pose means it, or its mask: white where pixels count, of the same size.
+    """The photo with this number, oriented as its pose assumes, or its mask: same size, white where pixels count.
 
     Raises `NotFound`: there is no such photo, or no mask, or it is a frame of a video.
     """
@@ -101,7 +101,7 @@ def draw(request: DrawRequest) -> dict[str, Any]:
         orientation=photo.orientation,
         mask_inverted=masked is not None and masked.inverted,
     )
-    # Without skew: a mask is for pixels that are not straightened yet.
+    # Without skew: the mask belongs to the photo before it is straightened.
     camera = Camera(lens.model, lens.width, lens.height, lens.params)
     images = load_images(Dataset(files, (camera,), (frame,), SourceFormat("images")), LONG_SIDE_PX)
     shown = images.counts_image(0) if request.name == "mask.png" else images.image(0)

@@ -1,4 +1,4 @@
-"""Two results compared in a child program, as poses need NumPy, which the web process never loads.
+"""Compares two results in a child program: poses need NumPy, which the web process never loads.
 
 The child is `python -m service.intake.result_comparison`.
 """

@@ -32,10 +32,10 @@ RATIO_FREE_BYTES = 16 * 2**20
 _METHODS = {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}
 _ENCRYPTED = 0x1 | 0x40
 _TAR_BLOCK = 512
-# What a zip's table of contents may take for an entry: its fixed part, a path of 900 bytes, and some extra fields.
+# Most bytes of an entry in a zip's table of contents: its fixed part, a path of 900 bytes, and some extra fields.
 _ENTRY_BYTES = 1200
-# What a tar may put before an entry (a long path, attributes), or say for all entries in sum: tarfile takes time by the
-# square of the one, before Python 3.11.10 and 3.12.6, and copies the other for each entry.
+# Most bytes of a tar's extended headers: before an entry (a long path, attributes), and global ones in sum. tarfile
+# parses the former in quadratic time before Python 3.11.10 and 3.12.6, and copies the latter for each entry.
 _HEAD_BYTES = 2**14
 _HEADS = {
     *(tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK, tarfile.SOLARIS_XHDTYPE),
@@ -89,7 +89,7 @@ def unpack(request: UnpackRequest) -> dict[str, Any]:
     ) as error:
         raise sink.rejected(f"The archive is damaged or of an unknown kind: {error}.") from None
     except OSError as error:
-        if error.errno != errno.EINVAL:  # a place before the file's start, which the archive names
+        if error.errno != errno.EINVAL:  # the archive names an offset before the file's start
             raise
         raise sink.rejected("The archive is damaged: it names places outside of itself.") from None
     except MemoryError:
@@ -172,7 +172,7 @@ class _Sink:
 
 
 class _ZipBytes(io.BufferedReader):
-    """A zip's bytes, at most so many at once: zipfile reads the table of contents as a whole."""
+    """A zip's bytes, limited per read: zipfile reads the table of contents as a whole."""
 
     most = sys.maxsize
 
@@ -231,7 +231,7 @@ def _unpack_tar(plain: IO[bytes] | gzip.GzipFile, sink: _Sink) -> None:
 
 
 def _member_of(sink: _Sink) -> type[tarfile.TarInfo]:
-    """An entry of this archive, whose heads are refused before they are read where they are too long."""
+    """The type of this archive's entries; it refuses extended headers that are too long before it reads them."""
     heads, for_all = sink.entries_max * _ENTRY_BYTES, _HEAD_BYTES
 
     class Member(tarfile.TarInfo):

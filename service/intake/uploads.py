@@ -26,7 +26,7 @@ def raw_request(*media_types: str) -> dict[str, Any]:
 def limited_body(
     request: Request, limit_bytes: int, budget: DiskBudget | None = None
 ) -> AsyncGenerator[bytes, None]:
-    """The body of the request as `capped` passes it; refused at once where its Content-Length exceeds the limits."""
+    """The request's body through `capped`; refused at once if its Content-Length exceeds the limits."""
     announced = request.headers.get("content-length", "")
     if announced.isdigit():
         if int(announced) > limit_bytes:

@@ -36,8 +36,8 @@ IdempotencyKey = Annotated[
 
 def job_etag(job: JobView) -> str:
     """A weak ETag of the job's current state."""
-    # Other jobs change the position of a queued job but not its revision. A browser may have the job as its owner sees
-    # it, and as strangers do.
+    # Other jobs change the position of a queued job but not its revision. A browser may cache the job as its owner sees
+    # it and as a link shows it.
     return f'W/"{job.revision}-{job.queue_position or 0}{"" if job.dataset_id else "-shared"}"'
 
 
@@ -61,7 +61,7 @@ def preferred_wait_s(prefer: str | None) -> float | None:
 
 
 async def waited_for(jobs: JobStore, job_id: str, seconds: float, closing: asyncio.Event) -> JobView:
-    """The job once it has ended, after ``seconds``, or when the service stops."""
+    """Waits until the job ends, ``seconds`` pass or the service stops; returns the job."""
     waiting = asyncio.create_task(jobs.wait(job_id, timeout_s=seconds))
     try:
         await first_done(waiting, closing.wait())

@@ -65,9 +65,9 @@ async def get_report(job_id: JobId, caller: ReadCaller) -> Response:
 
 @router.get("/comparison/{other_id}", responses=declared("expired", "result_not_ready", "state_conflict"))
 async def compare_jobs(job_id: JobId, other_id: JobId, caller: ReadCaller) -> Comparison:
-    """Which of two results is better, this job's (`first`) or the other one's (`second`), and by what.
+    """Compares two results: which is better, this job's (`first`) or the other one's (`second`), and by which measure.
 
-    It is said of the poses that were returned, from both jobs' `report.json` and `poses.json`.
+    The comparison is about the returned poses; it reads both jobs' `report.json` and `poses.json`.
     """
     first, second = [await _result_files(caller, each) for each in (job_id, other_id)]
     return await compared(caller, first, second)

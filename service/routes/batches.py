@@ -37,7 +37,7 @@ async def submit_batch(caller: JobWriter, body: NewBatch, idempotency_key: Idemp
 
 @router.get("/{batch_id}", response_model=BatchView)
 async def get_batch(batch_id: BatchId, caller: ReadCaller) -> Response:
-    """How many of its jobs are in each state, and the state and verdict of each."""
+    """Counts the batch's jobs by state, and lists the state and verdict of each."""
     batch = await Batches(caller.jobs).batch(batch_id)
     return _response(batch, 200, {} if batch.final else {"Retry-After": POLL_S})
 
@@ -48,7 +48,7 @@ async def get_batch(batch_id: BatchId, caller: ReadCaller) -> Response:
     responses={202: {"model": BatchView, "description": "Cancellation is requested."}},
 )
 async def cancel_batch(batch_id: BatchId, caller: JobWriter, body: CancelJob = _DISCARD) -> Response:
-    """Cancels those of its jobs that have not ended, each with a partial result if requested."""
+    """Cancels the batch's jobs that have not ended, each with a partial result if requested."""
     batch = await Batches(caller.jobs).cancel_batch(batch_id, keep_partial=body.keep_partial)
     return _response(batch, 200 if batch.final else 202, {})
 

@@ -138,7 +138,7 @@ async def put_file(
     "/{dataset_id}/files/{path:path}", status_code=204, responses=declared("dataset_not_open", "unsafe_path")
 )
 async def delete_file(dataset_id: DatasetId, path: str, caller: DatasetWriter) -> None:
-    """Takes a file out of an open dataset."""
+    """Deletes a file of an open dataset."""
     await caller.datasets.delete_file(dataset_id, checked_path(path))
 
 
@@ -168,7 +168,7 @@ def _announced_digest(header: str | None) -> str | None:
     openapi_extra=raw_request("application/zip", "application/x-tar", "application/gzip"),
 )
 async def upload_archive(dataset_id: DatasetId, request: Request, caller: DatasetWriter) -> DatasetView:
-    """Uploads all files of a zip, tar or tar.gz, sent as the raw body. A folder around everything is dropped.
+    """Uploads all files of a zip, tar or tar.gz, sent as the raw body. A folder that wraps everything is dropped.
 
     If one entry is not acceptable, no file is added.
     """

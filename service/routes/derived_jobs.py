@@ -76,7 +76,7 @@ async def list_images(
     ] = "",
     limit: Annotated[int, Query(ge=1, le=100_000)] = 100_000,
 ) -> ImageList:
-    """The report's rows of the images, in the dataset's order or sorted; unknown values come last."""
+    """The rows of the report's image table, in the dataset's order or sorted; unknown values come last."""
     column = sort.removeprefix("-")
     if column and column not in IMAGE_COLUMNS:
         detail = f"There is no column {column!r}; there are {', '.join(sorted(IMAGE_COLUMNS))}."

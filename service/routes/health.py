@@ -25,7 +25,7 @@ _LACKING = (*(f"{need}_unavailable" for need in _NEEDS), "unavailable")
 async def livez(request: Request) -> Health:
     """The process runs and responds. Its dependencies are not checked: a restart would not repair them.
 
-    503 where it lost connections to a database that answers: a restart repairs that.
+    503 if it lost its connections to a database that answers, which a restart repairs.
     """
     # Not as a dependency, which would need a free thread.
     if service_of(request).stores.monitor.broken.is_set():

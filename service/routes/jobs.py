@@ -169,9 +169,9 @@ async def cancel_job(job_id: JobId, caller: JobWriter, body: CancelJob = _DISCAR
     responses=declared("address_refused", "state_conflict", "expired"),
 )
 async def deliver_job(job_id: JobId, caller: JobWriter, body: DeliverTo) -> Response:
-    """Sends files of the job to addresses, by PUT, now or once it is over; `delivered` says what became of them.
+    """Sends files of the job to addresses by PUT, now or once it has ended; `delivered` holds the outcomes.
 
-    A new address for a file replaces the one before, for example where that has expired.
+    A new address for a file replaces the previous one, for example one that has expired.
     """
     return job_response(await caller.jobs.deliver(job_id, body), status=202)
 

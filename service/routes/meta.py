@@ -1,4 +1,4 @@
-"""What the service says of itself: version, limits, the options of jobs, what jobs used and do."""
+"""Information about the service: version, limits, options of jobs, usage, and the operator's view."""
 
 from __future__ import annotations
 
@@ -93,9 +93,9 @@ async def get_usage(
     ] = None,
     accept: Annotated[str, Header()] = "",
 ) -> Response:
-    """Processor and GPU seconds of attempts that ended in these days.
+    """Processor and GPU seconds of attempts that ended on these days.
 
-    Of your tenant; of all tenants with the scope `admin`.
+    Counts your tenant's attempts; with the scope `admin`, those of all tenants.
     """
     keys = [key for key in get_args(UsageKey) if key in by.split(",")]
     if len(keys) != len(by.split(",")):
@@ -117,7 +117,7 @@ async def get_usage(
 
 @router.get("/v1/operator")
 async def get_operator_view(caller: Admin, response: Response) -> OperatorView:
-    """The installation at work, of all tenants: queue, slots and what they do, sizes, the latest failures."""
+    """The installation's state over all tenants: queue, slots and their jobs, sizes, and the latest failures."""
     response.headers["Cache-Control"] = "no-store"
     seen = await caller.service.stores.monitor.overview()
     return seen.model_copy(update={"upload_room_bytes": caller.service.disk_budget.free_bytes()})

@@ -42,7 +42,7 @@ async def list_photos(
 async def get_photos_picture(
     dataset_id: DatasetId, caller: ReadCaller, if_none_match: IfNoneMatch = None
 ) -> Response:
-    """All photos of a checked dataset in one picture; `sheet` of the list of photos says where each lies."""
+    """All photos of a checked dataset in one picture; `sheet` in the list of photos locates each."""
     return await _shown(caller, dataset_id, PHOTO_SHEET, "image/jpeg", if_none_match)
 
 
@@ -58,7 +58,7 @@ async def get_dataset_thumbnail(
 async def get_photo_picture(
     dataset_id: DatasetId, photo: _Photo, caller: ReadCaller, if_none_match: IfNoneMatch = None
 ) -> Response:
-    """One photo of a checked dataset, turned as its pose means it, at most 1,280 px long; not of a video."""
+    """One photo of a checked dataset, oriented as its pose assumes, at most 1,280 px long; not for frames of videos."""
     return await _drawn(caller, dataset_id, photo, "picture.jpg", "image/jpeg", if_none_match)
 
 
@@ -66,7 +66,7 @@ async def get_photo_picture(
 async def get_photo_mask(
     dataset_id: DatasetId, photo: _Photo, caller: ReadCaller, if_none_match: IfNoneMatch = None
 ) -> Response:
-    """The mask of one photo, of the same size as its picture: pixels count where it is white."""
+    """The mask of one photo, the same size as its picture: pixels count where it is white."""
     return await _drawn(caller, dataset_id, photo, "mask.png", "image/png", if_none_match)
 
 
@@ -83,7 +83,7 @@ async def _shown(
 async def _drawn(
     caller: Caller, dataset_id: str, photo: int, name: PictureName, kind: str, if_none_match: str | None
 ) -> Response:
-    """Nothing is decoded for a browser that has the picture."""
+    """Draws the picture, or responds 304 without decoding anything if the browser has it."""
     picture = await photo_picture(caller, dataset_id, photo, name)
     headers = _headers(picture.etag)
     if not none_match(if_none_match, headers["ETag"]):

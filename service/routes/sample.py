@@ -19,7 +19,7 @@ from workers.process.die_with_parent import dying_with_parent
 
 logger = logging.getLogger(__name__)
 router = APIRouter(tags=["service"])
-# The quick start's: small, so that it is made and refined while one waits, and large enough for feature matches.
+# As in the quick start: small enough to make and refine while one waits, large enough for feature matches.
 SAMPLE = ("--views", "32", "--size", "160", "--noise", "0.12", "--seed", "3")
 _making = asyncio.Lock()
 
@@ -32,7 +32,7 @@ _making = asyncio.Lock()
     },
 )
 async def get_sample(caller: ReadCaller) -> FileResponse:
-    """A zip of a made image set: a still life, whose poses were turned at random, by 10° on average."""
+    """A zip of a synthetic image set: a still life whose poses are turned at random, by 10° on average."""
     path = caller.service.settings.data_dir / "sample.zip"
     async with _making:
         if not path.is_file():
@@ -41,7 +41,7 @@ async def get_sample(caller: ReadCaller) -> FileResponse:
 
 
 async def _make(path: Path) -> None:
-    """Renders the set in a child process, which loads what this one must not."""
+    """Renders the set in a child process; its libraries must not be loaded here."""
     path.parent.mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(prefix="sample-", dir=path.parent))
     try:

@@ -48,7 +48,7 @@ async def share_artifact(
 
 @router.delete("/jobs/{job_id}/shares", status_code=204)
 async def revoke_shares(job_id: JobId, caller: JobWriter) -> None:
-    """Revokes all links to single files of this job: they open nothing from the next request on."""
+    """Revokes all links to single files of this job, from the next request on."""
     await caller.links.revoke_shares(job_id)
 
 
@@ -73,7 +73,7 @@ async def list_links(job_id: JobId, caller: ReadCaller) -> LinkList:
 
 @router.delete("/jobs/{job_id}/links/{link_id}", status_code=204)
 async def revoke_link(job_id: JobId, link_id: LinkId, caller: JobWriter) -> None:
-    """Revokes a link: it opens nothing from the next request on."""
+    """Revokes a link, from the next request on."""
     await caller.links.revoke(job_id, link_id)
 
 

@@ -1,7 +1,7 @@
-"""Files that do not come with a request.
+"""Files that clients send to the store, or that the service fetches.
 
-Clients send them directly to the store: signed URLs first, then verification of what arrived. Or the service fetches
-them from addresses.
+For the store, clients get signed URLs; the service then verifies what arrived. Or the service fetches files from their
+addresses.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ async def complete_upload(upload_id: UploadId, caller: DatasetWriter) -> FileVie
     ),
 )
 async def fetch_files(dataset_id: DatasetId, caller: DatasetWriter, body: NewFetches) -> UploadList:
-    """Has files fetched from their addresses: an upload for each, or none where one is refused.
+    """Fetches files from their addresses: creates an upload for each, or none if one is refused.
 
     A file without a `path` is an archive, which is unpacked completely or not at all. `POST …/finalize` waits for all
     of them and reports errors. Addresses may be signed; they are not shown again.
@@ -124,7 +124,7 @@ async def fetch_files(dataset_id: DatasetId, caller: DatasetWriter, body: NewFet
 
 @router.get("/datasets/{dataset_id}/fetches")
 async def list_fetches(dataset_id: DatasetId, caller: ReadCaller) -> UploadList:
-    """What is still being fetched or is not in the dataset yet, and what was rejected, oldest first."""
+    """Fetched uploads that are unfinished, not in the dataset yet, or rejected; oldest first."""
     await caller.datasets.get(dataset_id)
     pending = await caller.uploads.of_dataset(dataset_id)
     return UploadList(items=tuple(upload for upload in pending if upload.host is not None))

@@ -151,7 +151,7 @@ async def append_upload(
     caller: DatasetWriter,
     upload_offset: Annotated[int, Header(ge=0, lt=2**62, description="Offset of the first byte sent.")],
 ) -> Response:
-    """Appends bytes. Those that arrived are kept however the connection ends; `HEAD` returns how many.
+    """Appends bytes. If the connection breaks, those that arrived are kept; `HEAD` returns how many.
 
     After the last byte the upload is added to the dataset; an archive is unpacked completely or not at all.
     `POST …/finalize` waits for that and reports errors.
