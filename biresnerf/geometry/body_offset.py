@@ -23,7 +23,7 @@ LEAST_CAMERAS = 5
 ROBUST = 3 * 3.0**2
 # Errors of neighbours are alike and do not average out: by how much deviations count for more (docs/estimator.md).
 SHARED_ERRORS = 2.0
-INDEPENDENT = 12  # cameras at most that speak for an offset: along a path, errors add up
+INDEPENDENT = 12  # cameras at most that support an offset: along a path, errors add up
 FREEDOM = 4.0  # of Student's distribution, which errors are taken to have where offsets are compared
 STRONG = 10.0  # twice the logarithm of a Bayes factor (Kass and Raftery 1995)
 # A shift along a direction is left out if it is so few deviations from zero, and known no better than to this share of
@@ -53,11 +53,11 @@ AXES = _axes_turned()
 
 @dataclass(frozen=True, eq=False)
 class BodyOffset:
-    """What all given poses lack: ``given @ body_from_cam`` are the cameras'.
+    """The offset that all given poses share: ``given @ body_from_cam`` are the cameras' poses.
 
     Attributes:
         body_from_cam: [4, 4], in the given unit; its shift is zero along directions in which it is not known.
-        shift_deviation: along the least certain of the others, in the given unit; None where there are none.
+        shift_deviation: standard deviation along the least certain known direction, in the given unit; or None.
         known_along: directions in which the shift is known, or known to be zero: orthonormal columns [3, k] in the axes
             of the body.
     """
@@ -67,7 +67,7 @@ class BodyOffset:
     known_along: Array = field(default_factory=lambda: np.zeros((3, 0)))
 
     def then(self, further: BodyOffset | None) -> BodyOffset:
-        """Both, where the first is taken back already."""
+        """Compose with a further offset, found after this one was removed."""
         if further is None:
             return self
         known = [each for each in (self.shift_deviation, further.shift_deviation) if each is not None]
@@ -82,7 +82,7 @@ class BodyOffset:
 
 @dataclass(frozen=True, eq=False)
 class Tie:
-    """How given poses and those of other evidence belong together.
+    """How given poses relate to those of other evidence.
 
     Attributes:
         given_from_fitted: the frame.
@@ -102,7 +102,7 @@ class Tie:
     price: float
 
     def explains_more_than(self, other: Tie) -> bool:
-        """Whether this is to be believed in place of another tie of the same cameras, which is likelier before."""
+        """Whether to believe this tie rather than another of the same cameras that is likelier a priori."""
         counted = min(1.0, INDEPENDENT / len(self.weight))
         return counted * (self.likelihood - other.likelihood) - (self.price - other.price) > STRONG
 
@@ -110,9 +110,9 @@ class Tie:
 def tie(fitted: Array, given: Array) -> Tie:
     """The frame that ties poses [n, 4, 4] of the same cameras together, and the offset that the given ones share.
 
-    The errors of both are in what is found. An offset is believed if it explains more than its unknowns could by chance
+    The errors found include those of both. An offset is believed if it explains more than its unknowns could by chance
     where errors are alike: a turn of the axes (OpenCV's for OpenGL's, a roll by 90 degrees), any turn, a shift, or
-    both. From fewer than `LEAST_CAMERAS` none is.
+    both. None is believed with fewer than `LEAST_CAMERAS`.
     """
     poses = _Pair(np.asarray(fitted, np.float64), np.asarray(given, np.float64))
     found = poses.ties(np.eye(4))
@@ -163,7 +163,7 @@ class _Pair:
         return _likelihood(turned, shifted / self.spread)
 
     def ties(self, start: Array, *, turns: bool = False, price: float = 0.0) -> list[Tie]:
-        """Without a shift, and with one along the axes of the body where it can be told.
+        """Ties without a shift, and with one along the axes of the body where it can be determined.
 
         Args:
             start: `cam_from_body` [4, 4]; its turn is refined if ``turns``.
@@ -200,7 +200,7 @@ class _Pair:
 
     def _tie(self, fit: _Fit, price: float, deviation: float | None, axes: Array) -> Tie:
         body_from_cam = rigid_inverse(fit.cam_from_body)
-        # The offset's length is in the unit of the fitted poses; that of the given ones is asked for.
+        # The offset's length is in the unit of the fitted poses; the given ones' unit is required.
         body_from_cam[:3, 3] *= fit.frame.scale
         same = np.array_equal(body_from_cam, np.eye(4))
         offset = None if same else BodyOffset(body_from_cam, deviation, axes)
@@ -208,7 +208,7 @@ class _Pair:
         return Tie(fit.frame, offset, fit.rotation, fit.position, fit.weight, likelihood, price)
 
     def fit(self, cam_from_body: Array, axes: Array, *, turns: bool) -> _Fit:
-        """By Gauss-Newton steps of frame and offset, with weights from the residuals.
+        """Fit frame and offset by Gauss-Newton steps, with weights from the residuals.
 
         The poses that are better known are carried to the given ones, not the other way: from noisy poses a smaller
         frame with an offset would follow (regression dilution).
@@ -259,7 +259,7 @@ def _apart(given: Array, now: Array) -> tuple[Array, Array]:
 
 
 def _jacobian(now: Array, middle: Array, spread: float, axes: Array) -> Array:
-    """Of poses [n, 6, 10 + k]: by a turn, a shift and growth of their frame, and an offset's turn and shift.
+    """Jacobian of poses [n, 6, 10 + k] by a turn, a shift and growth of their frame, and an offset's turn and shift.
 
     The frame turns and grows about its middle, and lengths count in spreads of the rig.
     """
@@ -277,7 +277,7 @@ def _jacobian(now: Array, middle: Array, spread: float, axes: Array) -> Array:
 def _likelihood(turned: Array, shifted: Array) -> float:
     """The largest logarithm of the likelihood of errors [n, 3] and [n, 3], for any deviations of the two.
 
-    They are taken for Student's, of one camera together: a few that are far off count for little.
+    The errors of one camera are modelled as jointly Student's: a few outliers count for little.
     """
     squares = np.stack([(part**2).sum(1) for part in (turned, shifted)])
     variance = np.maximum(np.median(squares, axis=1, keepdims=True) / 3, EXACT**2)

@@ -46,7 +46,7 @@ class FrameError(FrozenModel):
 
 
 class PoseError(FrozenModel):
-    """Pose errors of a rig: after alignment by a similarity, and as the poses stand."""
+    """Pose errors of a rig: after alignment by a similarity, and without."""
 
     cameras: int
     aligned: FrameError = Field(

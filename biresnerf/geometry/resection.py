@@ -1,4 +1,4 @@
-"""Where a camera stands, from points whose place is known: three of them at a time, robustly.
+"""A camera's pose from known points: three at a time, robustly.
 
 The three-point problem is solved after Grunert (1841) in the form of Haralick et al., "Review and analysis of solutions
 of the three point perspective pose estimation problem" (IJCV 1994): a quartic in the ratio of two distances. Consensus

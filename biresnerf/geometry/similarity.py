@@ -154,7 +154,7 @@ def align_robust(
 
 
 def align_points(in_a: Array, in_b: Array) -> Similarity:
-    """As `align_robust`, of points [n, 3]; a line leaves the turn about it open.
+    """As `align_robust`, for points [n, 3]; points on a line leave the rotation about it open.
 
     Raises:
         ValueError: as `align_by_spread`.

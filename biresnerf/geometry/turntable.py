@@ -22,7 +22,7 @@ class Ring:
     Attributes:
         azimuth: of each camera [n].
         elevation: of all cameras above the origin's plane [].
-        pan: by which the z axis is seen to the right of the optical axis [].
+        pan: angle by which the z axis is seen to the right of the optical axis [].
         roll: of all cameras about their optical axes [].
         quarters: quarter turns [n], counter-clockwise, that set each photo upright.
     """

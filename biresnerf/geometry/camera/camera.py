@@ -96,7 +96,7 @@ class Intrinsics:
         return replace(self, **moved)
 
     def coefficients(self, image_index: Tensor) -> Coefficients:
-        """Those of each of the images [rays], without columns that are zero for all of the set."""
+        """The coefficients of each of the images [rays], without columns that are zero for the whole set."""
         rows = self.distortion[image_index]
         groups = (rows[:, part].unbind(1) for part in (ABOVE, BELOW, TANGENTIAL))
         return Coefficients(*(group[:count] for group, count in zip(groups, self.terms, strict=True)))
@@ -127,8 +127,7 @@ def directions_with_gradient(
 ) -> Tensor:
     """`directions_in_cam` as a function of the intrinsics' tensors, which may require gradients.
 
-    By the implicit function theorem, one step of Newton's method from the solution has the solution's derivatives:
-    nothing need be kept of the steps that led there.
+    By the implicit function theorem, one Newton step from the solution has its derivatives: no earlier step is kept.
 
     Args:
         directions: what `directions_in_cam` gave, of any precision.
@@ -165,7 +164,7 @@ def project(intrinsics: Intrinsics, image_index: Tensor, points_in_cam: Tensor) 
 def in_view(intrinsics: Intrinsics, image_index: Tensor, points_in_cam: Tensor) -> Tensor:
     """Which points [points, 3] of camera coordinates the images show, bool [points].
 
-    What lies farther out than all that the image shows is not in view, wherever the lens formula may fold it.
+    Points farther out than anything the image shows are not in view, wherever the lens formula may fold them.
     """
     _require(image_index, points_in_cam, 3)
     x, y = plane_position(intrinsics, image_index, points_in_cam.to(torch.float64))

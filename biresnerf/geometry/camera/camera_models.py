@@ -72,7 +72,7 @@ COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "sx1", "sy1", "b
 # How far a carrier may show anything from where its lens does, as a share of the photo's longer side: 0.05 px of 1000.
 # A feature is found to some 0.3 px.
 MOST_APART = 5e-5
-# A refined lens is of its own formula again if that misses it by no more than this share of what refining changed.
+# A refined lens gets its own formula again if the misfit is no more than this share of the refinement's change.
 MISSED_SHARE = 0.1
 
 
@@ -171,15 +171,15 @@ class Camera:
 
     @property
     def panorama(self) -> bool:
-        """Whether it is none with a lens: the photo shows all directions, forward in its middle."""
+        """Whether the photo is a panorama, without a lens: it shows all directions, forward in its middle."""
         return self.model == PANORAMA
 
     def full(self) -> FullParameters:
         """These intrinsics with all coefficients written out, and whether they are a fisheye's.
 
         Raises:
-            ValueError: no lens; or one of another formula that shows nothing in the photo's corners, or that none of
-                the two families shows alike.
+            ValueError: no lens; or one of another formula that shows nothing in the photo's corners, or that neither
+                family matches.
         """
         return _carried(self)[0] if self.model in SHAPES else full_parameters(self.model, self.params)
 
@@ -222,7 +222,7 @@ class Camera:
 def of_shape(
     model: str, fx: float, fy: float, cx: float, cy: float, shape: Sequence[float]
 ) -> tuple[str, tuple[float, ...]]:
-    """A carried model with its parameters, in one that has both focal lengths where they differ."""
+    """Name and parameters of a carried model; that with two focal lengths where they differ."""
     if model.startswith("SIMPLE_") and fx == fy:
         return model, (fx, cx, cy, *shape)
     return model.removeprefix("SIMPLE_"), (fx, fy, cx, cy, *shape)

@@ -1,7 +1,7 @@
-"""COLMAP's lenses of other formulas, each carried by the lens of our two families that shows the same over its photo.
+"""COLMAP's lenses of other formulas, each carried by the lens of our two families that matches it over its photo.
 
 Such a lens is a curve: how far from the principal point, in focal lengths, it shows what lies at an angle from its
-axis. `distortion` has curves with six or seven coefficients, one of which meets it more closely than a photo can tell;
+axis. `distortion` has curves with six or seven coefficients, one of which fits it more closely than a photo can show;
 the lens's own parameters stay with the camera. The formulas are those of COLMAP's src/colmap/sensor/models.h, after
 Devernay and Faugeras 2001 (FOV), Khomutenko et al. 2016 (EUCM) and Fitzgibbon 2001 (DIVISION).
 """
@@ -48,11 +48,11 @@ class Curve(NamedTuple):
 
 
 class Carrier(NamedTuple):
-    """What carries a lens over its photo.
+    """The curve that represents a lens over its photo.
 
     Attributes:
         curve: in focal lengths of the lens.
-        apart: how far from the lens's own curve it is at most, in its focal lengths.
+        apart: largest deviation from the lens's own curve, in its focal lengths.
         angles: [n], rad from the axis, out to the photo's farthest corner.
     """
 
@@ -86,7 +86,7 @@ def carrier_of(model: str, shape: tuple[float, ...], corner: float) -> Carrier:
 def fitted_curve(angles: Array, distances: Array, above: int, below: int, *, fisheye: bool) -> Curve:
     """The curve with so many coefficients that is nearest to distances [n] at angles [n] (rad).
 
-    Least squares times the denominator are linear; they are weighted by the one found before, until that stays.
+    Least squares times the denominator are linear; each round is weighted by the last one, until it converges.
     """
     on_plane = angles if fisheye else np.tan(angles)
     powers = on_plane[:, None] ** (2 * np.arange(max(above, below) + 1))

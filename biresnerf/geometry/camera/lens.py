@@ -90,7 +90,7 @@ def _border_seen(full: FullParameters, width: int, height: int) -> _Border:
 
 
 def _within_reach(full: FullParameters, target: NDArray[np.float64], xy: NDArray[np.float64]) -> _Border:
-    """Of border points that distortion brings from `xy` to `target` [n, 2]."""
+    """Check border points that distortion moves from `xy` to `target` [n, 2]."""
     far, seen = np.linalg.norm(target, axis=1), np.linalg.norm(xy, axis=1)
     reach = float(seen.max())
     if full.fisheye and reach >= np.pi:

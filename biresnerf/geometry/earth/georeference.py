@@ -1,4 +1,4 @@
-"""Which similarity carries cameras to measured positions, and whether these tell it at all."""
+"""The similarity from cameras to measured positions, and whether these determine it at all."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Georeference:
 
 
 class NoGeoreference(ValueError):
-    """Positions that tell no frame; the message says why, in a user's words."""
+    """Positions that determine no frame; the message tells users why."""
 
 
 def fit_positions(
@@ -58,10 +58,10 @@ def fit_positions(
         positions_m: in metres, in any frame.
         accuracy_m: stated standard deviations of the positions along the axes [m, 3], NaN where they are not known.
         rotations: of the cameras in the frame of the positions [m, 3, 3], as a gimbal measured them, NaN where it did
-            not; they tell the turn about a line.
+            not; they fix the rotation about a line.
 
     Raises:
-        NoGeoreference: too few positions; or all on a line, or scattered as far as they spread, so that a turn is open.
+        NoGeoreference: too few positions; or all on a line, or scattered as far as they spread: a turn is open.
     """
     if len(positions_m) < LEAST_POSITIONS:
         raise NoGeoreference(f"{len(positions_m)} photos have a position, and {LEAST_POSITIONS} are needed")
@@ -94,7 +94,7 @@ def fit_positions(
 
 
 def not_far_off(positions_m: Array) -> NDArray[np.bool_]:
-    """Positions [m] that are not so far from the others that they must be wrong."""
+    """Mask [m] of positions that are not so far from the others that they must be wrong."""
     away = np.linalg.norm(positions_m - np.median(positions_m, axis=0), axis=1)
     return np.asarray(away <= FARTHEST * np.median(away))
 
@@ -102,7 +102,7 @@ def not_far_off(positions_m: Array) -> NDArray[np.bool_]:
 def _along_a_line(
     world_from_cam: Array, there: Array, rotations: Array, used: NDArray[np.bool_], accuracy_m: Array | None
 ) -> Georeference:
-    """The similarity of cameras on a line, about which rotations [m, 3, 3] tell the turn."""
+    """The similarity of cameras on a line; rotations [m, 3, 3] fix the turn about it."""
     there[:, :3, :3] = rotations
     found = align_robust(world_from_cam[used], there[used], with_rotations=True)
     moved = found.apply_to_poses(world_from_cam)
