@@ -14,7 +14,7 @@ class Adam:
     """Adam (Kingma and Ba 2015) on some parameters; the learning rate is given at each step.
 
     `torch.optim.Adam` takes the same steps, but loads torch's compiler: two seconds of every process. One kernel moves
-    all parameters: a quarter of the time of an operation for each product and root on a CPU, one launch on a GPU.
+    all parameters: a quarter of the time of separate operations on a CPU, one launch on a GPU.
 
     Args:
         weight_decay: L2, added to the gradient.

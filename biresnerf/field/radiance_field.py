@@ -143,7 +143,7 @@ class RadianceField(ABC):
         """Discard the gradients of the last backward."""
 
     def release_memory(self) -> None:
-        """Free what a step takes besides the field itself; the next step takes it again, as large as it needs."""
+        """Free the memory of a step besides the field itself; the next step allocates it again as needed."""
         self.discard_gradients()
 
     @abstractmethod

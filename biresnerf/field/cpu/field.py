@@ -88,7 +88,7 @@ class CpuField(GridField):
     def _encode(
         self, x: np.ndarray, gradient: PositionGradient | None, role: str, modules: tuple[str, ...]
     ) -> tuple[np.ndarray, list[np.ndarray]]:
-        """Features [width, n] and each module's Jacobian, [levels, 0, n] where no gradient is asked for."""
+        """Features [width, n] and each module's Jacobian, [levels, 0, n] where no gradient is needed."""
         n, width = len(x) // 3, self._width(modules)
         derivatives, gradient = (0, PositionGradient()) if gradient is None else (6, gradient)
         features = self._buffers.take(f"{role} features", width, n)
@@ -124,7 +124,7 @@ class CpuField(GridField):
         return torch.from_numpy(result)
 
     def _density(self, x: np.ndarray, modules: tuple[str, ...], density: np.ndarray) -> None:
-        """Fill `density` [n] with that which these modules give at x [3 n]."""
+        """Fill `density` [n] with the density that these modules give at x [3 n]."""
         features, _ = self._encode(x, None, "density", modules)
         w1, w2 = self._first_layer(modules).reshape(-1), self._layers[1].reshape(-1)
         network.network_density(

@@ -44,7 +44,7 @@ def _inside(v):
 
 
 def clearances(occupied):
-    """How many blocks away from each the nearest one is that is not empty: uint8 [b, b, b] for cells [side] * 3.
+    """Distance of each block from the nearest that is not empty, in blocks: uint8 [b, b, b] for cells [side] * 3.
 
     Distances count diagonal neighbours, and end at `FARTHEST`. A block has `BLOCK` cells a side, one if they do not
     divide the grid.
@@ -191,7 +191,7 @@ def pack(origin, direction, t_buffer, dt_buffer, count, offset, unbounded, x, t,
 def bring_inside(x):
     """Replaces positions [3 n] that are not finite by the grid's edge, in place: tables are read without bounds checks.
 
-    As unsigned numbers, positive floats are ordered as they are, and what is negative or not finite is larger.
+    As unsigned numbers, positive floats keep their order, and negative or non-finite ones are larger.
     """
     bits = x.view(np.uint32)
     np.minimum(bits, _LARGEST_BITS, out=bits)
@@ -199,7 +199,7 @@ def bring_inside(x):
 
 @njit(**PARALLEL_KERNEL)
 def merge(density, offset, jitter, light_most, run_most, t_buffer, dt_buffer, count):
-    """Put the merged intervals of each ray in the place of its intervals in t_buffer, dt_buffer and count.
+    """Replace the intervals of each ray in t_buffer, dt_buffer and count by the merged ones.
 
     density [n] is of the intervals one after another, those of ray r from offset[r] on.
     """

@@ -1,8 +1,8 @@
 """A random field, rays and occupancy grid on which backends are compared; the same on every device.
 
-And what they are compared with on a GPU: tensor cores cut factors to TF32, which has 10 bits of mantissa. They do not
-round: with factors cut like this, Triton's interpreter gave the differences from the definition that an H200 gave, to
-each digit. Without it a gradient differs by a fifth where a unit is nearly silent.
+Also the definition for GPUs, whose tensor cores truncate factors to TF32 (10 bits of mantissa). They do not round: with
+truncated factors, Triton's interpreter gave the same differences from the definition as an H200, to each digit. Without
+truncation a gradient differs by a fifth where a unit is nearly silent.
 """
 
 from __future__ import annotations

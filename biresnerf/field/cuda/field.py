@@ -195,7 +195,7 @@ class CudaField(GridField):
         return samples if fits else None
 
     def _counted(self, rays: Rays, marching: Marching, gradient: PositionGradient) -> int:
-        """Samples of rays, for which buffers grow. Only here a step of the optimisation waits for the device."""
+        """Count samples of rays, and grow buffers for them. Only here does an optimisation step wait for the device."""
         count, side = len(rays.origin), marching.occupied.shape[0]
         w = self._reserve(count, 1, marching.most, side)
         self._begin(Pass(count, rays.trained, marching, gradient, 0))

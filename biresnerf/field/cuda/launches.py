@@ -24,7 +24,7 @@ def interpreted() -> bool:
 
 
 def refuse_the_wrong_mode(device: torch.device) -> None:
-    """The interpreter is for tests on machines without CUDA: it may neither slow a GPU down nor be missing here."""
+    """Raise `InputError` if the interpreter, meant for tests without CUDA, is on for a GPU or off without one."""
     if interpreted() == (device.type == "cuda"):
         raise InputError(
             "device_unavailable",

@@ -25,7 +25,7 @@ def merge(
     density, jitter, ray_offset, ray_count, merged_light, merged_most, middle, length, count, most, capacity,
     ray_capacity, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Put the merged intervals of each ray in the place of its intervals; a thread per ray.
+    """Replace the intervals of each ray by the merged ones; a thread per ray.
 
     A ray whose samples do not all fit the buffers, so that their densities are not known, is left without any.
     """

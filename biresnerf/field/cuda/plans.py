@@ -66,7 +66,7 @@ def backward(w: Workspace) -> list[Any]:
 
 
 def density(w: Workspace, whole: bool) -> list[Any]:
-    """Density of the points that are given as samples, or what the pose-estimation module alone makes of it."""
+    """Density of the points given as samples; if not `whole`, by the pose-estimation module alone."""
     if whole:
         modules, features = w.modules, {}
     else:

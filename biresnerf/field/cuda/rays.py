@@ -18,7 +18,7 @@ OPAQUE = tl.constexpr(100.0)  # e^-100 is 0 in float32; larger numbers would cos
 
 @triton.jit
 def _contraction(px, py, pz, UNBOUNDED: tl.constexpr):
-    """What a point is multiplied with on its way to [-0.5, 0.5]^3, and its largest coordinate m."""
+    """The factor that contracts a point to [-0.5, 0.5]^3, and its largest coordinate m."""
     m = tl.maximum(tl.abs(px), tl.maximum(tl.abs(py), tl.abs(pz)))
     factor = m * 0.0 + 0.5
     if UNBOUNDED:
@@ -109,7 +109,7 @@ def pack(
 ):  # fmt: skip
     """The intervals one after another: x [3, capacity] grid positions of their samples, t, dt, ray; one ray each.
 
-    Whichever ray is the last that fits writes how many samples there are, `taken` [1] (zero before).
+    The last ray that fits writes the number of samples, `taken` [1] (zero before).
     """
     r = tl.program_id(0)
     rays = tl.load(ray_count).to(tl.int32)

@@ -151,7 +151,7 @@ def merge(
     """Fewer intervals with the same light: t, dt, ray of `march`, given an estimate of their densities [n].
 
     A run of neighbours is one interval as long as it gives at most `merging.light` of the ray's light and has at most
-    `merging.most` members; its t is that of its only member, or where the ray's `jitter` [rays] says, 0 at its begin
+    `merging.most` members; its t is that of its only member, or where the ray's `jitter` [rays] says, 0 at its start
     and 1 at its end. Behind the interval that leaves less than `LEAST_TRANSMITTANCE` of the light the ray ends.
     """
     kept: list[tuple[float, float, int]] = []
