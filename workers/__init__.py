@@ -1,4 +1,4 @@
-"""What a job is, how it is queued, who runs it, what happens when it dies, where files lie.
+"""The job engine: datasets, jobs, queue, workers, recovery, and file storage.
 
 Nothing here loads torch except `workers.run.job_process`, the program of one job's child process.
 """

@@ -1,4 +1,4 @@
-"""One place that opens what a process needs of the engine: `async with open_stores(settings) as stores`."""
+"""Opens the engine's stores for a process: `async with open_stores(settings) as stores`."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Stores:
 
 @asynccontextmanager
 async def open_stores(settings: Settings) -> AsyncIterator[Stores]:
-    """Connect pool, queue and listener; needs ``settings.database_url`` and a migrated database.
+    """Connect pool, queue and listener; needs ``settings.database_url`` of a migrated database.
 
     Raises `SetupError`. Opening waits up to 30 s for the database.
     """
@@ -82,7 +82,7 @@ async def open_stores(settings: Settings) -> AsyncIterator[Stores]:
 
 
 async def _share_key(database: Database) -> bytes:
-    """A key that every replica has, made by the first to ask. Deleting its row makes a new one at the next start."""
+    """A key shared by all replicas; the first to ask creates it. Delete its row to get a new one at the next start."""
     await database.fetch(
         "INSERT INTO server_secrets (name, value) VALUES ('share', %s) ON CONFLICT DO NOTHING",
         secrets.token_bytes(KEY_BYTES),

@@ -1,1 +1,1 @@
-"""PostgreSQL: connections, schema, the private server, notifications. Knows no table but its own."""
+"""PostgreSQL: connections, schema, the private server, notifications. Knows only its own tables."""

@@ -1,4 +1,4 @@
-"""Rows that wait for work: claimed by one of many processes, and worked on many at a time."""
+"""Rows as work items: each is claimed by one of many processes, which works on several at a time."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from workers.settings.errors import Unavailable
 
 log = logging.getLogger(__name__)
 
-# Rows of `leased`, of each tenant the longest waiting.
+# The rows of each tenant that have waited longest.
 _CLAIM = """
     WITH waiting AS (
         SELECT work.id, work.due_at, work.leased_until > now() AS busy, row_number() OVER (PARTITION BY tenant
@@ -45,10 +45,10 @@ class ClaimedWork(ABC):
         self._under_way: set[asyncio.Task[None]] = set()
 
     async def run(self, stop: asyncio.Event) -> None:
-        """Claim and work until ``stop``; then end what is under way."""
+        """Claim and work until ``stop``; then finish or abandon what is under way, as `_end` does."""
         with self._listener.waiting("") as woken:
             while not stop.is_set():
-                woken.clear()  # before looking: what comes during the look is not missed
+                woken.clear()  # before the claim, so that a notification during it is not missed
                 room = self.at_once - len(self._under_way)
                 try:
                     claimed = await self._claim(room) if room else []
@@ -72,16 +72,16 @@ class ClaimedWork(ABC):
 
     @abstractmethod
     async def _claim(self, room: int) -> list[dict[str, Any]]:
-        """At most ``room`` rows, which no other process gets for a while."""
+        """Claim at most ``room`` rows; no other process gets them for a while."""
 
     @abstractmethod
     async def _work(self, row: dict[str, Any]) -> None:
-        """Do what a row asks for, and write down the outcome. Raises nothing."""
+        """Do a row's work and record the outcome. Raises nothing."""
 
 
 @contextlib.asynccontextmanager
 async def lease_renewed(renew: Callable[[], Awaitable[bool]], lease_s: float) -> AsyncIterator[None]:
-    """Renew a lease of ``lease_s`` for as long as the context lasts, or until ``renew`` says that it is lost."""
+    """Renew a lease of ``lease_s`` while the context lasts, or until ``renew`` returns False: it is lost."""
 
     async def keep() -> None:
         ours = True
@@ -98,11 +98,11 @@ async def lease_renewed(renew: Callable[[], Awaitable[bool]], lease_s: float) ->
 
 
 class LeasedWork(ClaimedWork):
-    """Work on rows that may take long: the lease of a row is renewed until it is given back or the row deleted.
+    """Work on rows that may take long: a row's lease is renewed until it is given back or the row is deleted.
 
-    Their table has the columns `id`, `due_at`, `round`, and `token`, `leased_until`, `losses`: who has a row, and how
-    many were lost in a row who had it (`losses.py`). ``owners`` joins it, as `work`, to a `tenant`, and begins the
-    condition of what can be done. At the end what is under way is left to others.
+    The table has the columns `id`, `due_at`, `round`, and `token`, `leased_until`, `losses`: who holds a row, and how
+    many holders in succession were lost (`losses.py`). ``owners`` joins it, as `work`, to a `tenant`, and begins the
+    WHERE clause that selects rows to work on. At shutdown, unfinished rows are left to other processes.
     """
 
     per_tenant: ClassVar[int]
@@ -115,7 +115,7 @@ class LeasedWork(ClaimedWork):
 
     @abstractmethod
     async def _do(self, row: dict[str, Any]) -> None:
-        """The work itself; `Unavailable` leads to another try."""
+        """Do the work; `Unavailable` leads to a retry."""
 
     async def _claim(self, room: int) -> list[dict[str, Any]]:
         values = {"lease_s": self._lease_s, "token": self._token, "per_tenant": self.per_tenant, "room": room}
@@ -129,7 +129,7 @@ class LeasedWork(ClaimedWork):
             while not doing.done():
                 await asyncio.wait({doing}, timeout=self._lease_s / 4)
                 if not doing.done() and not await self._renewed(row):
-                    return  # deleted, or taken for lost
+                    return  # deleted, or leased by another process
         except asyncio.CancelledError:
             doing.cancel()
             await asyncio.wait({doing})
@@ -157,11 +157,11 @@ class LeasedWork(ClaimedWork):
     ) -> None:
         back = f"UPDATE {self.table} SET token = NULL, leased_until = NULL, losses = 0,".encode()
         back += b" round = coalesce(%s, round), due_at = now() + make_interval(secs => %s) WHERE id = %s AND token = %s"
-        with contextlib.suppress(Unavailable, psycopg.Error):  # then the lease ends by itself
+        with contextlib.suppress(Unavailable, psycopg.Error):  # then the lease expires
             await self._database.fetch(back, round_, max(wait_s, self._poll_s), row["id"], self._token)
 
     async def _forget(self, connection: Connection, row_id: str) -> bool:
-        """Delete the row; whether it was ours still."""
+        """Delete the row; returns whether it was still ours."""
         sql = f"DELETE FROM {self.table} WHERE id = %s AND token = %s RETURNING id".encode()
         return await connection.row(sql, row_id, self._token) is not None
 

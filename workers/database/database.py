@@ -21,18 +21,18 @@ from workers.settings.errors import NotFound, SetupError, Unavailable
 
 log = logging.getLogger(__name__)
 
-# What a database that is away, or just went away, raises.
+# Errors of a database that is unavailable, or becomes so.
 AWAY = (
     *(psycopg.OperationalError, psycopg.InterfaceError, PoolTimeout, PoolClosed),
     psycopg.errors.IdleInTransactionSessionTimeout,
 )
-# A peer that vanished without a word (a host that lost power) is noticed within a minute.
+# A peer that vanished silently (a host that lost power) is noticed within a minute.
 CONNECT: dict[str, Any] = {
     "connect_timeout": 5,
     "keepalives_idle": 30,
     "keepalives_interval": 10,
     "keepalives_count": 3,
-    # Keepalives rest while bytes are under way; without this a query into a dead line waits a quarter of an hour.
+    # Keepalives pause while data is unacknowledged; without this a query on a dead connection hangs for 15 minutes.
     "tcp_user_timeout": 60_000,
 }
 RECONNECT_S = 1.0
@@ -46,7 +46,7 @@ Statement = LiteralString | bytes | SQL | Composed
 
 
 class Connection(psycopg.AsyncConnection[DictRow]):
-    """A connection that gives rows as dicts."""
+    """A connection that returns rows as dicts."""
 
     async def row(self, statement: Statement, *parameters: Any) -> DictRow | None:
         """The first row of a statement, if there is one."""
@@ -79,7 +79,7 @@ class Database:
     """One process's pool of connections. Use `open_database`.
 
     Attributes:
-        broken: set once the pool lost connections for good although the database answers: a restart mends it.
+        broken: set once the pool has lost connections for good though the database answers; needs a restart.
     """
 
     def __init__(self, url: str, pool: AsyncConnectionPool[Connection], answer_s: float) -> None:
@@ -88,19 +88,19 @@ class Database:
 
     @asynccontextmanager
     async def transaction(self) -> AsyncIterator[Connection]:
-        """A connection inside one transaction; raises `Unavailable` where the database is away.
+        """A connection inside one transaction; raises `Unavailable` if the database is away.
 
-        Also where it takes longer than it may: a connection can fall silent without an end.
+        Also raises it after a timeout: a connection can hang forever.
         """
         try:
-            # The return lies outside the limit: what was committed is not "too late".
+            # Returning the connection is not timed: a committed transaction must not be "too late".
             async with contextlib.AsyncExitStack() as at_end, asyncio.timeout(self._answer_s):
                 connection = await self.pool.getconn()
                 at_end.push_async_callback(self.pool.putconn, connection)
                 async with connection:
                     yield connection
         except TimeoutError as error:
-            await self.pool.drain()  # where one line is dead the others are, and each would cost as long
+            await self.pool.drain()  # the others are dead as well, and each would take as long
             raise Unavailable(
                 "database_unavailable", f"The database did not answer within {self._answer_s:g} s."
             ) from error
@@ -111,26 +111,26 @@ class Database:
     async def run(
         self, work: Callable[Concatenate[Connection, P], Awaitable[T]], *given: P.args, **named: P.kwargs
     ) -> T:
-        """The answer of ``work`` in a transaction of its own; raises `Unavailable`."""
+        """The result of ``work`` in its own transaction; raises `Unavailable`."""
         async with self.transaction() as connection:
             return await work(connection, *given, **named)
 
     async def fetch(self, statement: Statement, *parameters: Any) -> list[DictRow]:
-        """Rows of one statement in a transaction of its own."""
+        """The rows of one statement in its own transaction."""
         async with self.transaction() as connection:
             cursor = await connection.execute(statement, parameters)
             return await cursor.fetchall() if cursor.description else []
 
 
 class OwnedStore:
-    """Base of stores whose rows belong to tenants: as opened it sees those of all tenants, as the operator does."""
+    """Base of stores whose rows belong to tenants: initially it sees those of all, as the operator does."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
         self._tenant: str | None = None
 
     def for_tenant(self, tenant: str | None) -> Self:
-        """The store limited to this tenant, who cannot tell another tenant's rows from none; None: all tenants."""
+        """The store limited to this tenant: rows of others seem not to exist. None: all tenants."""
         bound = copy(self)
         bound._tenant = tenant
         return bound
@@ -149,17 +149,17 @@ async def open_database(
     """A pool of connections, closed at the end.
 
     Args:
-        connections: most connections of the pool.
-        patience_s: how long a caller waits for a free and living connection.
+        connections: maximum size of the pool.
+        patience_s: how long a caller waits for a working connection.
         opening_s: how long to wait for the database at the start.
-        silence_s: a transaction in which nothing is asked for so long is rolled back by the database.
-        answer_s: how long a transaction may take; a database that does not answer for so long is away.
+        silence_s: the database rolls back a transaction that is idle for so long.
+        answer_s: how long a transaction may take before the database counts as away.
 
     Raises `SetupError` if the database does not answer in time or is not migrated.
     """
 
     async def end_if_silent(connection: Connection) -> None:
-        # A process frozen within a transaction, or a host gone without a word, would hold its locks forever.
+        # A process frozen within a transaction, or a host that vanished, would hold its locks forever.
         await connection.execute(
             "SELECT set_config('idle_in_transaction_session_timeout', %s, false)",
             (str(round(1000 * silence_s)),),
@@ -171,7 +171,7 @@ async def open_database(
         min_size=1,
         max_size=connections,
         timeout=patience_s,
-        # The pool's own retries wait twice as long each time: minutes, after an outage of minutes.
+        # The pool's own backoff doubles each time: minutes, after an outage of minutes.
         reconnect_timeout=RECONNECT_S,
         reconnect_failed=_keep_trying,
         kwargs={"row_factory": dict_row, **CONNECT},
@@ -199,8 +199,8 @@ async def open_database(
 
 
 async def _watch(database: Database, pool: WholePool[Connection]) -> None:
-    """Sets ``database.broken`` where the pool lacks connections all the time and a fresh one works."""
-    in_vain = 0  # looks, not seconds: a frozen process did not look
+    """Sets ``database.broken`` if the pool lacks connections persistently though a new one works."""
+    in_vain = 0  # counts looks, not seconds: a frozen process does not look
     while True:
         await asyncio.sleep(LOOK_S)
         in_vain = in_vain + 1 if pool.lost() > 0 else 0
@@ -214,7 +214,7 @@ async def _watch(database: Database, pool: WholePool[Connection]) -> None:
 
 
 async def _answers(url: str) -> bool:
-    """Whether a connection beside the pool works."""
+    """Whether a connection outside the pool works."""
     try:
         async with await psycopg.AsyncConnection.connect(url, **CONNECT) as fresh:
             await fresh.execute("SELECT 1")
@@ -224,7 +224,7 @@ async def _answers(url: str) -> bool:
 
 
 async def _keep_trying(pool: AsyncConnectionPool[Connection]) -> None:
-    """Asking for a connection makes the pool connect again; if that fails too, it calls this again."""
+    """Request a connection, so that the pool reconnects; if that fails too, the pool calls this again."""
     with contextlib.suppress(PoolTimeout, PoolClosed):
         async with pool.connection(timeout=RECONNECT_S):
             return
@@ -244,5 +244,5 @@ def first_line(error: BaseException) -> str:
 
 
 def without_password(url: str) -> str:
-    """The address fit for a log."""
+    """The address without its password, for logs."""
     return re.sub(r"(://[^:/@]*):[^@]*@", r"\1:***@", url)

@@ -1,7 +1,7 @@
 """A private PostgreSQL as a child process of ours: no port, no password, no configuration.
 
 Only the programs come from a wheel. Its Python layer is not used: it trusts ``postmaster.pid`` blindly, and
-after a power cut the number in there can belong to an innocent process.
+after a power cut the PID in it can belong to an unrelated process.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ SERVER_OPTIONS = {
 class EmbeddedPostgres:
     """One PostgreSQL cluster under ``root``, run by at most one process at a time.
 
-    ``start`` it again after it died; ``stop`` it at the end. It shuts down by itself when this process dies.
-    It lets ``connections`` in at the same time.
+    Call ``start`` again after it died, and ``stop`` at the end. It shuts down when this process dies.
+    It accepts ``connections`` at a time.
     """
 
     def __init__(self, root: Path, *, pg_bin: Path | None = None, connections: int = 100) -> None:
@@ -70,8 +70,8 @@ class EmbeddedPostgres:
     def start(self, *, timeout_s: float = 60.0) -> str:
         """Start the server (creating the cluster the first time) and return its address once it answers.
 
-        Raises `SetupError`: no programs, another process uses the folder, unsuitable folder, server log's
-        end if it does not come up.
+        Raises `SetupError`: no programs, the folder is in use or unsuitable, or the server does not come up (with the
+        end of its log).
         """
         self._take_lock()
         self._refuse_network_folder()
@@ -218,10 +218,10 @@ class EmbeddedPostgres:
             )
 
     def _clear_remains(self) -> None:
-        """Wait for a killed predecessor's servers to end; drop a ``postmaster.pid`` that names a stranger.
+        """Wait for a killed predecessor's servers to end; delete a ``postmaster.pid`` that names another process.
 
-        The file stays where its process is just gone: PostgreSQL then looks itself whether anybody is still
-        attached to the old shared memory.
+        If its process no longer exists, the file stays: PostgreSQL then checks whether anything is still attached to
+        the old shared memory.
         """
         end = time.monotonic() + 20
         while ours := self._own_servers():
@@ -239,14 +239,14 @@ class EmbeddedPostgres:
         except FileNotFoundError:
             return
         except (ValueError, IndexError):
-            file.unlink()  # torn by a power cut; no server of this cluster runs, as was just made sure
+            file.unlink()  # torn by a power cut; no server of this cluster is running, see above
             return
         if psutil.pid_exists(pid):
             log.warning("postmaster.pid names process %d, which is not our server; removing it", pid)
             file.unlink()
 
     def _own_servers(self) -> list[psutil.Process]:
-        """Server processes that work in our data folder (the postmaster and its backends)."""
+        """Server processes that run in our data folder (the postmaster and its backends)."""
         found = []
         for process in psutil.process_iter(["name", "status"]):
             if not (process.info["name"] or "").startswith("postgres"):

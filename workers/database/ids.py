@@ -21,7 +21,7 @@ def new_id(prefix: str) -> str:
 
 
 def cursor_after(*place: str | datetime) -> str:
-    """An opaque cursor that says where a page ended."""
+    """An opaque cursor for the place where a page ended."""
     plain = [part.isoformat() if isinstance(part, datetime) else part for part in place]
     return base64.urlsafe_b64encode(json.dumps(plain).encode()).decode().rstrip("=")
 

@@ -1,4 +1,4 @@
-"""The queues of jobs: the one module that knows Procrastinate, which keeps them.
+"""The job queues, kept by Procrastinate; no other module knows it.
 
 We use its schema and its public `JobManager`, inside our own transactions. An entry of the queue is ``todo``,
 ``doing`` (a worker has it) or over. Its `Worker` is not used: its heartbeats run in the event loop, stop when a worker
@@ -7,7 +7,7 @@ kept silent; and it reports the end of a job without asking whether the entry is
 promise (tests/workers/queue/test_heartbeat.py, test_fenced_worker.py, test_queue_contract.py). The loop of
 `workers.queue.lane` takes its place.
 
-Other SQL reads the queue through the views and writes it through the function that are defined here.
+Other SQL reads the queue through the views and writes it through the function that is defined here.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ ALWAYS = datetime(1970, 1, 1, tzinfo=UTC)
 # When a held entry is due, unless `offer_queue_entry` is called.
 NEVER = datetime(9999, 1, 1, tzinfo=UTC)
 
-# Its last migration in the oldest version that we allow. A newer version's are steps of their own.
+# Procrastinate's last migration in the oldest version that we allow. Newer ones are separate steps.
 SCHEMA_STEP, SCHEMA_UNTIL = "000_procrastinate", "03.04.00_50_post_add_retry_failed_job_procedure"
 _DROP_VIEWS = "DROP VIEW queue_entries, queue_workers;"
 _INTERFACE = """
@@ -77,7 +77,7 @@ class Entry:
 def schema_steps() -> list[tuple[str, str]]:
     """Name and SQL of the queue's schema, and of each migration that the installed version adds to it.
 
-    On an empty database the first is enough: it holds the others.
+    On an empty database the first suffices: it includes the others.
     """
     files = sorted(Path(SchemaManager.get_migrations_path()).glob("*.sql"))
     later = [
@@ -91,7 +91,7 @@ def schema_steps() -> list[tuple[str, str]]:
 async def enqueue(connection: Connection, job_id: str, kind: JobKind, *, order: int, held: bool) -> int:
     """Add a job and return the entry's id.
 
-    Of jobs of one kind, the one of lower ``order`` runs earlier; ``held`` waits for `offer_queue_entry`.
+    Within a kind, jobs of lower ``order`` run first; a ``held`` one waits for `offer_queue_entry`.
     """
     job = Job(
         queue=kind,
@@ -108,9 +108,9 @@ async def enqueue(connection: Connection, job_id: str, kind: JobKind, *, order: 
 
 
 async def take(connection: Connection, worker_id: int, kinds: Sequence[JobKind] = KINDS) -> Entry | None:
-    """The next entry of ``kinds``, for a worker that works on none of them; none where none is due.
+    """The next due entry of ``kinds``, if any, for a worker that has none of them.
 
-    An entry that the worker already has comes first: the answer was lost with the connection.
+    An entry that the worker already holds comes first: the earlier answer was lost with the connection.
     """
     await connection.execute(HEARTBEAT, (worker_id,))
     held = await connection.rows(
@@ -130,9 +130,9 @@ async def take(connection: Connection, worker_id: int, kinds: Sequence[JobKind] 
 async def acknowledge(
     connection: Connection, entry_id: int, worker_id: int, *, again_in_s: float | None
 ) -> bool:
-    """End the worker's work on an entry: it is over, or due again in so many seconds.
+    """End the worker's hold on an entry: it is done, or due again in ``again_in_s`` seconds.
 
-    False, and nothing is changed, where the entry is another worker's by now.
+    Returns False, and changes nothing, if another worker holds the entry by now.
     """
     if not await lock_taken(connection, entry_id, worker_id):
         return False
@@ -144,7 +144,7 @@ async def acknowledge(
 
 
 async def lock_taken(connection: Connection, entry_id: int, worker_id: int | None) -> bool:
-    """Whether the worker, or any worker, has the entry; it stays so until the end of the transaction."""
+    """Whether the worker, or any worker, holds the entry; locks it until the end of the transaction."""
     taken = (
         "SELECT 1 FROM procrastinate_jobs WHERE id = %s AND status = 'doing'"
         " AND (%s::bigint IS NULL OR worker_id = %s) FOR UPDATE"
@@ -153,8 +153,8 @@ async def lock_taken(connection: Connection, entry_id: int, worker_id: int | Non
 
 
 async def put_back(connection: Connection, entry_id: int, in_s: float = 0) -> None:
-    """Offer an entry again that a worker has."""
-    # By the database's clock, which the queue goes by: a worker's own may be an hour off.
+    """Offer again an entry that a worker holds."""
+    # By the database's clock, as the queue: a worker's own may be an hour off.
     later = "SELECT clock_timestamp() + make_interval(secs => %s)"
     due = await connection.value(later, in_s) if in_s else ALWAYS
     await _manager(connection).retry_job_by_id_async(entry_id, retry_at=due)
@@ -163,17 +163,17 @@ async def put_back(connection: Connection, entry_id: int, in_s: float = 0) -> No
 
 
 async def abort(connection: Connection, entry_id: int) -> None:
-    """Take an entry out of the queue that a dead worker has."""
+    """Remove from the queue an entry that a dead worker holds."""
     await _manager(connection).finish_job_by_id_async(entry_id, Status.ABORTED, delete_job=False)
 
 
 async def cancel(connection: Connection, entry_id: int) -> None:
-    """Take a waiting entry out of the queue; wakes the worker that has it, see `subject_of`."""
+    """Cancel an entry: remove it if it waits, else wake the worker that holds it (see `subject_of`)."""
     await _manager(connection).cancel_job_by_id_async(entry_id, abort=True)
 
 
 def subject_of(notification: str) -> str:
-    """What a notification on `CHANNELS` is about: `NEW_ENTRY`, or the id of the entry that is to be cancelled."""
+    """The subject of a notification on `CHANNELS`: `NEW_ENTRY`, or the id of an entry to cancel."""
     content = json.loads(notification)
     return NEW_ENTRY if content["type"] == "job_inserted" else str(content["job_id"])
 
@@ -189,7 +189,7 @@ async def unregister_worker(connection: Connection, worker_id: int | None) -> No
 
 
 async def entries_of_worker(connection: Connection, worker_id: int | None) -> list[int]:
-    """Entries that the worker has, or any worker, in the order in which they are to be locked."""
+    """Entries that the worker, or any worker, holds, in locking order."""
     rows = await connection.rows(
         "SELECT id FROM procrastinate_jobs WHERE status = 'doing'"
         " AND (%s::bigint IS NULL OR worker_id = %s) ORDER BY id",
@@ -210,7 +210,7 @@ async def entries_of_silent_workers(connection: Connection, silent_s: float) -> 
 
 
 async def delete_old_entries(connection: Connection) -> None:
-    """Forget entries that were over a day ago."""
+    """Delete entries that ended more than a day ago."""
     await _manager(connection).delete_old_jobs(
         KEEP_ENTRIES_H, include_failed=True, include_cancelled=True, include_aborted=True
     )
@@ -244,7 +244,7 @@ def _manager(connection: Connection) -> JobManager:
 
 
 def _adapted(value: Any) -> Any:
-    """With JSON where the engine has a dict."""
+    """The arguments with dicts as JSON."""
     if isinstance(value, dict):
         return Jsonb(value)
     if isinstance(value, list):

@@ -1,8 +1,8 @@
-"""Work that takes its process down is given up: one rule for all that one of many processes takes.
+"""Gives up work that keeps killing its process: one rule for all work that processes claim.
 
-A take counts while its process could be lost to the work itself, as while it reads what a stranger sent. Whoever ends
-that part alive, however it went, ends the count, and so does whoever gets further than all takes before. So only takes
-that were lost in a row, without progress, give work up: kills and restarts of a healthy service seldom hit it so often.
+A claim (take) counts while the work itself could kill the process, as while it parses strangers' files. The count is
+reset when a process survives that part, with whatever outcome, or gets further than all before it. So work is given up
+only after consecutive losses without progress, which kills and restarts of a healthy service seldom cause.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ GIVE_BACK_S = 2.0
 
 
 class LostTooOften(Exception):
-    """`LOSSES_MAX` takes in a row were lost."""
+    """`LOSSES_MAX` processes in succession were lost to this work."""
 
 
 @contextlib.asynccontextmanager
 async def counted(database: Database, column: str, row_id: str | None) -> AsyncIterator[None]:
-    """Around the part of a take that may cost its process; ``column`` (``table.name``) counts the row's losses.
+    """Wraps work that may kill its process; ``column`` (``table.name``) counts the row's losses.
 
     Raises:
         LostTooOften: before the work begins.
@@ -41,7 +41,7 @@ async def counted(database: Database, column: str, row_id: str | None) -> AsyncI
 
 
 async def at_an_end(database: Database, statement: str, *values: object) -> None:
-    """A statement at the end of a take: perhaps of the process, which waits for no database that is away."""
+    """Run a statement at the end of a claim; gives up soon if the database is away: the process may be ending."""
     with contextlib.suppress(Unavailable, TimeoutError):
         async with asyncio.timeout(GIVE_BACK_S):
             await database.fetch(statement, *values)

@@ -1,6 +1,6 @@
 """Brings a database up to date: the queue's schema and our numbered files, in one transaction.
 
-Files lie in a folder for each release. Those of a release that is out never change: the next one adds its own.
+Each release has a folder of files. They never change once it is out: the next release adds its own.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Notifications: a LISTEN connection of each process wakes local waiters, who then read the tables.
+"""Notifications: each process has a LISTEN connection that wakes local waiters, which then read the tables.
 
-A notification only says "look"; what happened is in the tables. A lost one costs a poll interval, no event.
+A notification only says "look"; the tables hold what happened. If one is lost, its event is seen at the next poll.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from workers.database.database import AWAY, CONNECT, Database, first_line
 from workers.process.waiting import retry_while_unavailable
 from workers.settings.errors import Unavailable
 
-QUIET_S = 60.0  # without a notification: time to ask whether the connection lives
+QUIET_S = 60.0  # without a notification: then check the connection
 ANSWER_S = 10.0
 
 
 class Listener:
-    """Wakes who waits for a subject, as a rule a job.
+    """Wakes those who wait for a subject, usually a job.
 
     Args:
         poll_s: how long a lost notification can go unnoticed.
-        channels: where to listen.
-        subject_of: what a notification is about.
+        channels: the channels to listen on.
+        subject_of: maps a notification to its subject.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class Listener:
                 del self._waiting[subject]
 
     async def run(self) -> None:
-        """Listen until cancelled; reconnects without end, and wakes everybody after a gap."""
+        """Listen until cancelled; always reconnects, and wakes everybody after a gap."""
         await retry_while_unavailable(self._listen)
 
     async def _listen(self) -> None:
@@ -70,7 +70,7 @@ class Listener:
                     async for notification in connection.notifies(timeout=QUIET_S):
                         self._wake(self._subject_of(notification.payload))
                     async with asyncio.timeout(ANSWER_S):
-                        await connection.execute("SELECT 1")  # a line can be dead without an end
+                        await connection.execute("SELECT 1")  # a dead connection may never say so
         except (*AWAY, TimeoutError) as error:
             raise Unavailable(
                 "database_unavailable", f"The listener lost the database: {first_line(error)}"

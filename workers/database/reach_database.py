@@ -1,4 +1,4 @@
-"""The database for a command that runs beside the service or without it."""
+"""The database for commands, whether or not the service is running."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from workers.settings.settings import Settings
 
 @contextmanager
 def reached_database(settings: Settings, *, migrated: bool = True) -> Iterator[str]:
-    """The address of the database: the one of the settings, or the private one of the data folder.
+    """The address of the settings' database, or of the private one in the data folder.
 
-    A private one that runs already (below `biresnerf up`) is used as it is; else it is started for the time
-    of the block. It is brought up to date first, unless ``migrated`` is off. Raises `SetupError`.
+    A private one is started for the block unless it is running already (below `biresnerf up`). The database is migrated
+    first, unless ``migrated`` is False. Raises `SetupError`.
     """
     if settings.database_url is not None:
         if migrated:

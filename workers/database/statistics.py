@@ -1,4 +1,4 @@
-"""What monitoring asks of the whole installation, read from the database in one look."""
+"""The figures of the whole installation for monitoring, read in one snapshot."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ class Statistics:
     """The installation at one moment.
 
     Attributes:
-        queue: rows of the view ``queue_depth``: what waits for a slot of one kind, and what runs on one.
-        slots: rows (kind, busy, slots): how many living slots of a kind do, or do not, run a refinement; exports run
-            beside them.
-        bounds_s: of the buckets of durations.
-        tallies: rows (name, label, bucket, count, amount): how often something happened, and what it adds up to. They
-            only ever grow. Durations have a bucket, all else is in bucket 0.
+        queue: rows of the view ``queue_depth``: jobs that wait for a kind of slot, and that run on one.
+        slots: rows (kind, busy, slots): living slots of a kind that run a refinement, and that run none; exports do not
+            count.
+        bounds_s: the bounds of the duration buckets.
+        tallies: rows (name, label, bucket, count, amount): how often something happened, and the sum of its amounts.
+            They never decrease. Durations have a bucket, all else is in bucket 0.
     """
 
     jobs: dict[JobState, int]
@@ -77,7 +77,7 @@ async def read_statistics(database: Database, stall_s: float) -> Statistics:
 
 
 async def fold_tallies(connection: Connection) -> None:
-    """Adds the single counts up, in the caller's transaction; one caller at a time."""
+    """Sums up the single counts, in the caller's transaction; one caller at a time."""
     await connection.execute(
         "WITH taken AS (DELETE FROM tally_log RETURNING name, label, bucket, amount)"
         " INSERT INTO tallies (name, label, bucket, count, amount)"
@@ -88,7 +88,7 @@ async def fold_tallies(connection: Connection) -> None:
 
 
 async def fold_use(connection: Connection) -> None:
-    """Adds the records of single attempts up."""
+    """Sums up the records of single attempts."""
     await connection.execute(
         "WITH taken AS (DELETE FROM use_records WHERE (day, tenant, key_id, device) IN ("
         " SELECT day, tenant, key_id, device FROM use_records GROUP BY 1, 2, 3, 4 HAVING count(*) > 1) RETURNING *)"
@@ -98,7 +98,7 @@ async def fold_use(connection: Connection) -> None:
 
 
 async def announce_slot(database: Database, host: str, name: str, worker_id: int) -> None:
-    """Writes down which worker of the queue a slot is; forgets those that are gone."""
+    """Records a slot's worker id in the queue; deletes slots that are gone."""
     async with database.transaction() as connection:
         await connection.execute(
             "DELETE FROM slots WHERE NOT EXISTS (SELECT FROM queue_workers WHERE id = slots.worker_id)"

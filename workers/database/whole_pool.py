@@ -1,4 +1,4 @@
-"""A pool that loses no connection when whoever takes or returns one is cancelled."""
+"""A pool that loses no connection when a task is cancelled while it takes or returns one."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ T = TypeVar("T")
 
 
 class WholePool(AsyncConnectionPool[ACT]):
-    """The base class forgets a connection, but counts it for ever, where a cancellation meets its return.
+    """The base class leaks a connection if a cancellation interrupts its return.
 
-    Here taking, returning and draining are tasks of their own, which nobody cancels halfway. Connections are tested
-    when they are taken, so that those killed with the server are replaced unseen.
+    Here taking, returning and draining are separate tasks, which are never cancelled halfway. Connections are tested
+    when they are taken, so those that the server killed are replaced transparently.
     """
 
     def __init__(self, conninfo: str, **named: Any) -> None:
@@ -26,9 +26,9 @@ class WholePool(AsyncConnectionPool[ACT]):
         self._own: set[asyncio.Task[Any]] = set()
 
     def lost(self) -> int:
-        """How many connections the pool counts that neither it nor anybody else has.
+        """How many of the pool's counted connections nobody holds.
 
-        Those that are being made count too, so that only a number above 0 for long is a fault.
+        Includes those that are being opened, so only a number that stays above 0 is a fault.
         """
         held = self.get_stats()
         return int(held["pool_size"]) - int(held["pool_available"]) - self._lent - self._tested
@@ -39,7 +39,7 @@ class WholePool(AsyncConnectionPool[ACT]):
         try:
             return await asyncio.shield(taking)
         except asyncio.CancelledError:
-            taking.cancel()  # it gives back what it is about to test
+            taking.cancel()  # `_take` returns the connection that it is testing
             taking.add_done_callback(self._return_unused)
             raise
 

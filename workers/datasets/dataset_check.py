@@ -34,12 +34,12 @@ from workers.store.trash import discard, forget
 
 log = logging.getLogger(__name__)
 
-CHECK_NICE = 5  # more urgent than a job: somebody waits for it
+CHECK_NICE = 5  # a user waits for it: more urgent than a job
 
 EXIT_INPUT_ERROR = 2
 CHECKS = "checks"
-LOOK_S = 0.5  # between two looks at a check that another process makes
-# A check may take so long: for any set, for each file, and by their bytes.
+LOOK_S = 0.5  # poll interval while another process runs the check
+# Time limit of a check: per set, plus per file, plus by size.
 ANY_S, FILE_S, BYTES_PER_S = 120.0, 10.0, 100e3
 FATAL = JobError(
     code="check_crashed",
@@ -50,7 +50,7 @@ FATAL = JobError(
 
 @dataclass
 class Take:
-    """A dataset that this process checks, and how many of its photos it has read by now."""
+    """This process's claim on the check of a dataset, and how many photos it has read so far."""
 
     dataset_id: str
     token: uuid.UUID = field(default_factory=uuid.uuid4)
@@ -58,9 +58,9 @@ class Take:
 
 
 class Checker:
-    """Checks ``finalizing`` datasets, one at a time in this process and each by one process only.
+    """Checks ``finalizing`` datasets, one at a time per process, and each in one process only.
 
-    Tenants take turns: many datasets of one hold up another's by one check.
+    Tenants take turns: another tenant's many datasets delay a check by one.
     """
 
     def __init__(self, database: Database, files: FileStore, settings: Settings) -> None:
@@ -68,7 +68,7 @@ class Checker:
         self._turns = Turns(1)  # decoding a thousand photos is enough work for one machine
 
     async def check(self, dataset_id: str) -> None:
-        """Returns once the dataset is not ``finalizing`` any more, after our check or another process's."""
+        """Returns once the dataset is no longer ``finalizing``, whichever process checked it."""
         take = Take(dataset_id)
         owned = await self._rows("SELECT tenant FROM datasets WHERE id = %s", dataset_id)
         if not owned:
@@ -83,7 +83,7 @@ class Checker:
             await asyncio.sleep(LOOK_S)
 
     async def _rows(self, statement: Statement, *values: object) -> list[DictRow]:
-        """Those of a statement; waits for a database that is away."""
+        """The rows of a statement; waits for a database that is away."""
         return await retry_while_unavailable(lambda: self._database.fetch(statement, *values))
 
     async def unfinished(self) -> tuple[str, ...]:
@@ -96,9 +96,9 @@ class Checker:
         return tuple(row["id"] for row in rows)
 
     async def _take(self, take: Take) -> bool:
-        """Take or renew the lease and write down how far the check is; whether the dataset is ours.
+        """Take or renew the lease and record the check's progress; returns whether the dataset is ours.
 
-        A lease, not a lock: who is frozen or cut off loses it.
+        A lease, not a lock: a process that is frozen or cut off loses it.
         """
         rows = await self._database.fetch(
             "UPDATE datasets SET check_token = %s, check_until = clock_timestamp() + make_interval(secs => %s),"
@@ -123,7 +123,7 @@ class Checker:
                 )
                 files = [(row["key"], row["path"]) for row in rows]
                 outcome = await self._outcome(files, shown, take)
-        except BaseException:  # a full disk, a shutdown: it was not the files that ended it
+        except BaseException:  # a full disk or a shutdown, not the files' fault
             await at_an_end(
                 self._database,
                 "UPDATE datasets SET check_token = NULL, check_until = NULL"
@@ -136,11 +136,11 @@ class Checker:
     async def _outcome(
         self, members: Sequence[tuple[str, str]], shown: str, take: Take
     ) -> CheckReport | JobError:
-        """Run the check program on the files, given as (key, path). Its crash or timeout rejects them too.
+        """Run the check program on the files, given as (key, path). A crash or timeout rejects them, too.
 
-        What pages show of a good set is stored below the key ``shown``.
+        Stores what pages show of a good set below the key ``shown``.
 
-        Where it is killed (perhaps by the kernel, because another process took too much memory) it is tried once more.
+        If the program is killed (possibly by the kernel, for another process's memory use), it is run once more.
 
         Raises:
             OSError: the disk is full, which says nothing about the files.
@@ -165,7 +165,7 @@ class Checker:
 
 
 async def _record(connection: Connection, take: Take, outcome: CheckReport | JobError) -> None:
-    """Write the outcome down, unless another process has the lease by now."""
+    """Record the outcome, unless another process has the lease by now."""
     found = Jsonb(outcome.model_dump(mode="json"))
     ours = await connection.row(
         "UPDATE datasets SET state = %s, report = %s, error = %s, revision = revision + 1,"
@@ -179,13 +179,13 @@ async def _record(connection: Connection, take: Take, outcome: CheckReport | Job
 
 
 def _enough_s(dataset: Path) -> float:
-    """Seconds that honest files take at most, also on a busy machine: a few of them hold no place for minutes."""
+    """Most seconds that honest files take, even on a busy machine, so that small sets get a short limit."""
     sizes = [path.stat().st_size for path in dataset.rglob("*") if path.is_file()]
     return ANY_S + FILE_S * len(sizes) + sum(sizes) / BYTES_PER_S
 
 
 def _photos_read(said: bytes) -> int:
-    """What a line of the program says of its progress; 0 if it is about something else."""
+    """The photos read, by a line of the program; 0 if the line is about something else."""
     with contextlib.suppress(ValueError, TypeError, KeyError):
         return int(json.loads(said)["photos_read"])
     return 0
@@ -194,7 +194,7 @@ def _photos_read(said: bytes) -> int:
 async def _run(
     dataset: Path, errors: Path, settings: Settings, take: Take
 ) -> tuple[CheckReport | JobError, bool]:
-    """The outcome, and whether a signal ended the program. Raises `OSError` where it found no room to write."""
+    """The outcome, and whether a signal ended the program. Raises `OSError` if the disk was full."""
     memory = memory_shares(memory_limit(), settings.processes).check
     variables = {"OMP_NUM_THREADS": "1", CHECK_VARIABLE: str(memory)}
     child = await Child.start(settings.check_command, dataset, errors, variables, CHECK_NICE)

@@ -1,9 +1,9 @@
 """The program that validates a dataset: `python -m workers.datasets.dataset_check_process FOLDER`.
 
 Writes lines of JSON to standard output: ``{"photos_read": n}`` after each photo, and at the end ``{"report": {...}}``
-(exit status 0) or ``{"error": a fault}`` (exit status 2). Leaves in a folder beside it what pages show of the set.
-Exits with `EXIT_DISK` where it finds no room to write. It reads what strangers sent, so it confines itself first:
-memory, CPU time, size of files. Loads neither torch nor pycolmap; poses that are missing are found by the job.
+(exit status 0) or ``{"error": a fault}`` (exit status 2). Writes what pages show of the set into a folder beside it.
+Exits with `EXIT_DISK` if the disk is full. It reads untrusted files, so it first limits its memory, CPU time and file
+sizes. Loads neither torch nor pycolmap; the job finds missing poses.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ FILE_BYTES = 64 * 2**20
 def main(folder: Path) -> int:
     """Check ``folder``; returns the exit status."""
     out = os.fdopen(os.dup(1), "w", buffering=1)
-    os.dup2(2, 1)  # whatever a library prints must not mix with the answer
+    os.dup2(2, 1)  # what libraries print must not mix with the answer
 
     def told(**said: object) -> None:
         out.write(json.dumps(said) + "\n")
@@ -59,9 +59,9 @@ def main(folder: Path) -> int:
 def check(
     folder: Path, shown: Path, on_photo: Callable[[int], object] = lambda _count: None
 ) -> dict[str, Any]:
-    """Read everything in ``folder`` and decode every image; returns what was found, and writes ``shown`` for pages.
+    """Read ``folder`` and decode every image; returns the findings, and writes ``shown`` for pages.
 
-    ``on_photo`` is called with the number of photos read so far, after each.
+    Calls ``on_photo`` after each photo, with the number read so far.
 
     Raises:
         InputError: what is wrong, with which file, and a hint.
@@ -98,7 +98,7 @@ def check(
 
 
 def confine() -> None:
-    """Take no more than a check needs, whatever the files say."""
+    """Limit this process to what a check needs."""
     for kind, amount in (
         (resource.RLIMIT_AS, _memory_bytes()),
         (resource.RLIMIT_CPU, CPU_S),

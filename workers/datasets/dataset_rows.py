@@ -22,14 +22,14 @@ DATASET = """
             ORDER BY place) AS missing
     FROM datasets LEFT JOIN LATERAL (SELECT count(*) AS files, sum(size) AS bytes
         FROM dataset_files WHERE dataset_id = datasets.id) AS total ON true"""
-# With the store's tenant as parameter; none for all tenants.
+# The parameter is the store's tenant; None for all tenants.
 MINE = "datasets.tenant = coalesce(%s, datasets.tenant)"
-# Waits for its first job.
+# A dataset that waits for its first job.
 UNUSED = (
     "(state IN ('open', 'finalizing', 'ready')"
     " AND NOT EXISTS (SELECT 1 FROM dataset_jobs WHERE dataset_id = datasets.id))"
 )
-# Files of the manifest that lack, and a key where the same tenant's same bytes lie.
+# Missing files of the manifest whose bytes the same tenant has sent before, with their key.
 KNOWN = f"""
     SELECT DISTINCT ON (entry.path) entry.path, file.key, file.size, file.sha256
     FROM datasets, jsonb_to_recordset(datasets.manifest) AS entry(path text, size bigint, sha256 text)
@@ -44,9 +44,9 @@ RESERVED_NAME = re.compile(r"#\d+$")
 async def record_files(
     connection: Connection, dataset_id: str, stored: Mapping[str, StoredFile], upload_id: str | None
 ) -> tuple[list[DatasetFile], int]:
-    """Make stored files, by their paths, the dataset's, whose row is locked. What was there is trash.
+    """Add stored files, by path, to a dataset whose row is locked. Replaced files go to the trash.
 
-    ``upload_id``: the upload that brought them. Returns the files, and how many took the place of another.
+    ``upload_id``: the upload that brought them. Returns the files, and how many replaced another.
     """
     paths, files = list(stored), list(stored.values())
     if upload_id is not None:
@@ -86,7 +86,7 @@ async def require_places(
     *,
     overwrite: bool,
 ) -> int:
-    """That ``paths`` may be files of ``size`` bytes in all; returns the bytes of the dataset's other files.
+    """Check that ``paths`` may be added with ``size`` bytes in all; returns the bytes of the other files.
 
     Raises `Conflict` (``file_exists``), `LimitReached` (``too_many_files``, ``body_too_large``).
     """
@@ -106,7 +106,7 @@ async def require_places(
 
 
 async def lock_dataset(connection: Connection, dataset_id: str, tenant: str | None) -> DatasetState:
-    """The state of the dataset, which stays as it is until the transaction ends; raises `NotFound`."""
+    """Lock the dataset until the transaction ends, and return its state; raises `NotFound`."""
     sql = f"SELECT state FROM datasets WHERE id = %s AND {MINE} FOR UPDATE"
     row = await connection.required_row(f"No dataset {dataset_id}.", sql, dataset_id, tenant)
     state: DatasetState = row["state"]

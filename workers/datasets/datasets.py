@@ -1,4 +1,4 @@
-"""The dataset record: create, fill with files, check, list, delete. For the service; never loads torch."""
+"""Dataset records: create, add files, check, list, delete. For the service; never loads torch."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from workers.store.trash import delete_unless_rescued, discard, rescue
 from workers.tenants.tenants import LOCAL_TENANT
 
 COPIES_AT_ONCE = 8
-# Stores a file under a key, in so many bytes at most.
+# Stores a file under a key, up to a number of bytes.
 _Store: TypeAlias = Callable[[str, int], Awaitable[StoredFile]]
 FILE = "SELECT path, key, size, sha256, created_at FROM dataset_files"
 
@@ -110,7 +110,7 @@ class DatasetStore(OwnedStore):
         ``upload_id``: the upload that brought the bytes, whose size the tenant's quota has counted already.
         Raises `NotFound`, `Conflict` (``dataset_not_open``, ``file_exists``), `LimitReached`
         (``body_too_large``, ``too_many_files``), `InputError` (``unsafe_path``, ``digest_mismatch``).
-        Where it raises, the dataset is as before.
+        If it raises, the dataset is unchanged.
         """
 
         async def stored(key: str, room: int) -> StoredFile:
@@ -121,11 +121,11 @@ class DatasetStore(OwnedStore):
     async def add_files(
         self, dataset_id: str, files: Mapping[str, Path], *, upload_id: str | None = None
     ) -> None:
-        """Store local files under their relative paths: all, or none where one cannot be.
+        """Store local files under their relative paths: all, or none if one fails.
 
-        Raises as `add_file` does. A file that is there is replaced.
+        Raises as `add_file` does. Existing files are replaced.
         """
-        # The file store's part, for each: its key and what room there is.
+        # Stores each file, given its key and the room that is left.
         storing = {
             path: (lambda key, room, file=file: self._files.put_path(key, file, limit_bytes=room))
             for path, file in files.items()
@@ -134,7 +134,7 @@ class DatasetStore(OwnedStore):
 
     @contextlib.asynccontextmanager
     async def importing(self, dataset_id: str) -> AsyncIterator[None]:
-        """While inside, `being_imported` says so, also to other processes."""
+        """Within the context, `being_imported` is true in all processes."""
         token = uuid.uuid4()
 
         async def sign_of_life() -> bool:
@@ -151,7 +151,7 @@ class DatasetStore(OwnedStore):
             async with lease_renewed(sign_of_life, 2 * self._settings.beat_s):
                 yield
         finally:
-            with contextlib.suppress(Unavailable):  # then it ends by itself
+            with contextlib.suppress(Unavailable):  # then it expires
                 await self._database.fetch("DELETE FROM dataset_imports WHERE token = %s", token)
 
     async def being_imported(self, dataset_id: str) -> bool:
@@ -170,7 +170,7 @@ class DatasetStore(OwnedStore):
         trusted: bool,
         upload_id: str | None = None,
     ) -> tuple[DatasetFile, bool]:
-        """Like `add_file`, from a key of the store that others may write to, unless it is ``trusted``.
+        """Like `add_file`, from a key of the store, to which others may write unless it is ``trusted``.
 
         Raises `NotFound` also where there is no ``source``.
         """
@@ -179,7 +179,7 @@ class DatasetStore(OwnedStore):
             if size > room:
                 raise LimitReached("body_too_large", f"{path} has more than the {room} bytes left for it.")
             file = await self._files.copy(source, key)
-            # Of the copy, which no other process can write to: the source may change while it is read.
+            # Hash the copy, which no other process can write to: the source may change meanwhile.
             found = sha256 if trusted else await self._files.sha256(key)
             if (file.size, found) != (size, sha256):
                 raise InputError(
@@ -193,9 +193,9 @@ class DatasetStore(OwnedStore):
         return await self._add_one(dataset_id, path, copied, upload_id, overwrite=True)
 
     async def fill_known(self, dataset_id: str) -> DatasetView:
-        """Copy what the manifest names and the same tenant has sent before; returns the dataset.
+        """Copy files of the manifest that the same tenant has sent before; returns the dataset.
 
-        By digest and size, within one tenant: no tenant learns what others have sent. Raises `NotFound`,
+        Compares digest and size within one tenant, so no tenant learns what others have sent. Raises `NotFound`,
         `LimitReached`.
         """
         known = await self._database.fetch(KNOWN, dataset_id, self._tenant)
@@ -203,7 +203,7 @@ class DatasetStore(OwnedStore):
 
         async def copy_one(row: dict[str, Any]) -> None:
             async with turns:
-                with contextlib.suppress(NotFound):  # deleted just now: it has to be sent after all
+                with contextlib.suppress(NotFound):  # deleted just now: the client has to send it
                     await self.add_copy(
                         *(dataset_id, row["path"], row["key"]),
                         **{"size": row["size"], "sha256": row["sha256"], "trusted": True},
@@ -226,10 +226,10 @@ class DatasetStore(OwnedStore):
     async def _add(
         self, dataset_id: str, storing: Mapping[str, _Store], upload_id: str | None, *, overwrite: bool
     ) -> tuple[Sequence[DatasetFile], int]:
-        """The files, and how many took the place of another."""
-        # A folder of its own for each upload: one that fails or comes too late never touches an older file.
+        """Adds the files; returns them, and how many replaced another."""
+        # Each upload has its own folder: one that fails or comes too late never touches an older file.
         folder = f"datasets/{dataset_id}/files/{new_id('v')}"
-        # And one for each of its files: that of a file that is replaced goes to the trash.
+        # And each file has its own: that of a replaced file goes to the trash.
         keys = {path: file_key(f"{folder}/{number}", path) for number, path in enumerate(storing)}
         paths, stored = list(storing), {}
         async with self._database.transaction() as connection:
@@ -238,7 +238,7 @@ class DatasetStore(OwnedStore):
                 connection, self._settings, dataset_id, paths, 0, overwrite=overwrite
             )
             await require_byte_quota(connection, dataset_id, 1 if upload_id is None else 0)
-            # Until the files are recorded: this process may be killed before that.
+            # Trash until the files are recorded: this process may be killed before that.
             await discard(connection, folder, after_s=self._settings.upload_expiry_s)
         room = min(self._settings.max_file_bytes, self._settings.max_dataset_bytes - there)
         try:
@@ -252,11 +252,11 @@ class DatasetStore(OwnedStore):
                 )
                 await rescue(connection, folder)
                 recorded = await record_files(connection, dataset_id, stored, upload_id)
-                # All is counted now, also what the files replaced and what the upload has left.
+                # Everything is counted now, including replaced files and the rest of the upload.
                 await require_byte_quota(connection, dataset_id, 0)
                 return recorded
         except BaseException:
-            # Not where they were recorded and only the acknowledgement was lost.
+            # They may have been recorded, with only the acknowledgement lost.
             await delete_unless_rescued(self._database, self._files, folder)
             raise
 
@@ -272,7 +272,7 @@ class DatasetStore(OwnedStore):
         return DatasetFile.model_validate(row)
 
     async def delete_file(self, dataset_id: str, path: str) -> None:
-        """Take a file out of an open dataset; raises `NotFound`, `Conflict` (``dataset_not_open``)."""
+        """Delete a file of an open dataset; raises `NotFound`, `Conflict` (``dataset_not_open``)."""
         async with self._database.transaction() as connection:
             await require_open(connection, dataset_id, self._tenant)
             row = await connection.required_row(
@@ -298,7 +298,7 @@ class DatasetStore(OwnedStore):
         return page_of(map(DatasetFile.model_validate, rows), limit, ("path",))
 
     async def shown(self, dataset_id: str, name: str) -> bytes:
-        """A file that shows a checked dataset; raises `NotFound`, `Expired`."""
+        """A file that pages show of a checked dataset; raises `NotFound`, `Expired`."""
         if (await self.get(dataset_id)).state == "expired":
             raise Expired(f"The files of dataset {dataset_id} were not used for long and are gone.")
         key = f"{shown_key(dataset_id)}/{name}"
@@ -310,9 +310,9 @@ class DatasetStore(OwnedStore):
             ) from None
 
     async def finalize(self, dataset_id: str) -> DatasetView:
-        """Freeze the content: ``open`` becomes ``finalizing`` (other states come back as they are).
+        """Freeze the content: ``open`` becomes ``finalizing`` (other states are returned unchanged).
 
-        Raises `NotFound`, `Conflict` (``dataset_not_complete``: manifest files lack, or no file at all).
+        Raises `NotFound`, `Conflict` (``dataset_not_complete``: files of the manifest are missing, or there are none).
         Then call `check` (in a background task, or awaited), which leads to ``ready`` or ``rejected``.
         """
         async with self._database.transaction() as connection:
@@ -330,16 +330,16 @@ class DatasetStore(OwnedStore):
             return await self._required(connection, dataset_id)
 
     async def check(self, dataset_id: str) -> DatasetView:
-        """Validate a ``finalizing`` dataset in a child process and write the outcome; idempotent.
+        """Validate a ``finalizing`` dataset in a child process and record the outcome; idempotent.
 
-        Only one check of a dataset runs at a time, over all processes; the others wait for its outcome. Other
-        states come back as they are. Raises `NotFound`.
+        Only one check of a dataset runs at a time, over all processes; other callers wait for its outcome. Datasets in
+        other states are returned unchanged. Raises `NotFound`.
         """
         await self._checker.check(dataset_id)
         return await retry_while_unavailable(lambda: self.get(dataset_id))
 
     async def unfinished(self) -> tuple[str, ...]:
-        """Ids left in ``finalizing`` that no process checks (it died, or has others to do first)."""
+        """Ids of ``finalizing`` datasets that no process is checking: it died, or checks others first."""
         return await self._checker.unfinished()
 
     async def delete(self, dataset_id: str) -> None:

@@ -1,8 +1,8 @@
-"""Fetches uploads from the addresses that users gave: a dispatcher's work, as no other process reaches the world.
+"""Fetches uploads from users' addresses, in dispatchers: only they may reach the internet.
 
-What arrives is stored in pieces, as with uploads that clients send, so a fetch that broke goes on where it stopped
-if the file is still the same. A web process then brings the upload into its dataset. Addresses are secrets: no log and
-no error contains more of them than the host.
+Data is stored in pieces, as for clients' uploads, so an interrupted fetch resumes where it stopped if the file is
+unchanged. A web process then adds the upload to its dataset. Addresses are secrets: logs and errors contain only their
+host.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Fetcher(TransferWork):
                 await self._set_back(row, before, failed)
 
     async def _set_back(self, row: dict[str, Any], before: Upload, failed: TransferFailed) -> None:
-        """Have it tried again later, or reject the upload. Only tries in a row that bring little are counted."""
+        """Schedule a retry, or reject the upload. Only consecutive tries that bring little data are counted."""
         now = await self._uploads.get(before.id)
         round_ = 0 if now.received - before.received >= PIECE_MAX_BYTES else row["round"] + 1
         if await self._comes_again(row, failed, round_):
@@ -77,7 +77,7 @@ class Fetcher(TransferWork):
         error = failed.error(now.host, now.path or "the archive", "fetch_failed")
         log.info("upload %s is rejected: %s", now.id, error)
         async with self._database.transaction() as connection:
-            # The upload first, then its address: who deletes it locks them in this order.
+            # Locks the upload first, then its address, as deleting it does.
             ours = await connection.row(
                 f"UPDATE uploads SET state = 'rejected', error = %s WHERE id = %s AND {_MINE} RETURNING folder",
                 *(Jsonb(error.model_dump()), now.id, self._token),
@@ -108,10 +108,10 @@ class Fetcher(TransferWork):
             await self._store(upload, chunks, total, row["size"])
 
     async def _begun(self, upload: Upload, start: int, etag: str | None) -> Upload:
-        """The upload with the bytes before ``start`` alone, and the tag of what follows."""
+        """Keep only the upload's bytes before ``start``, and record the ETag of what follows; returns the upload."""
         async with self._database.transaction() as connection:
             if start < upload.received:
-                # Another folder: what a lost process may still write goes with the old one.
+                # A new folder: a lost process may still write into the old one, which is discarded.
                 folder = f"datasets/{upload.dataset_id}/uploads/{upload.id}-{secrets.token_hex(4)}"
                 await connection.execute("DELETE FROM upload_pieces WHERE upload_id = %s", (upload.id,))
                 await connection.execute(
@@ -158,9 +158,9 @@ class Fetcher(TransferWork):
         await self._add(upload, bytes(piece), have)
 
     async def _add(self, upload: Upload, piece: bytes, size: int) -> Upload:
-        """Store a piece of an upload that has ``size`` bytes, as far as is known; with the last one it is received.
+        """Store a piece of an upload of ``size`` bytes, as far as is known; the last piece makes it received.
 
-        Raises `Conflict` where another process has it now, `LimitReached` (``quota_exhausted``, ``storage_full``).
+        Raises `Conflict` if another process has it now, `LimitReached` (``quota_exhausted``, ``storage_full``).
         """
         if self._disk is not None:
             await asyncio.to_thread(self._disk.require, size - upload.received)
@@ -195,7 +195,7 @@ def _other_size(found: int | None, said: int) -> TransferFailed:
 
 
 def _extent(answer: Answer, received: int, etag: str | None) -> tuple[int | None, int | None]:
-    """Where the body begins in the file, none if that is of no use, and the file's size if it is said.
+    """Where the body begins in the file, None if it cannot be used; and the file's size, if stated.
 
     Raises `TransferFailed`.
     """

@@ -28,7 +28,7 @@ SMALLEST_PX = 16  # of sets with too many photos to show
 
 
 def small_side(count: int) -> int:
-    """Long side, px, at which so many photos are shown."""
+    """The long side, px, at which ``count`` photos are shown."""
     return next((side for most, side in CELL_PX if count <= most), SMALLEST_PX)
 
 
@@ -40,10 +40,10 @@ def write_shown(
     folder: Path,
     asked: Sequence[PoseReading],
 ) -> None:
-    """The list of photos with their poses, all photos in one picture, and the first one, into ``folder``.
+    """Write into ``folder``: the list of photos with their poses, a contact sheet, and the first photo.
 
     Args:
-        sent: the paths of the set's own files in the folder ``checked``, which by now has frames of videos as well.
+        sent: the paths of the user's files in ``checked``, which now also has frames of videos.
         asked: the reading of given poses that the user is asked about; empty for none.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -88,7 +88,7 @@ def _inside(path: Path, folder: Path) -> str:
 
 
 def expected_seconds(dataset: Dataset, *, unbounded: bool) -> dict[PresetName, tuple[float, float]]:
-    """Least and most seconds that a job with each preset would take, on a machine as that of the latest job here."""
+    """Least and most seconds of a job with each preset, on a machine like that of the latest job here."""
     device, threads = _latest_machine()
     rates, adjusts = machine_rates(device, threads), can_be_adjusted(len(as_views(dataset)))
     found: dict[PresetName, tuple[float, float]] = {}
@@ -100,7 +100,7 @@ def expected_seconds(dataset: Dataset, *, unbounded: bool) -> dict[PresetName, t
 
 
 def preset_here() -> PresetName:
-    """The preset of a job that names none, on a machine as that of the latest job here."""
+    """The default preset on a machine like that of the latest job here."""
     return PRESET_ON[_latest_machine()[0]]
 
 

@@ -80,7 +80,7 @@ class UploadStore(OwnedStore):
             return await self._insert(connection, dataset_id, kind, size, path, sha256, state=state)
 
     async def fetch(self, dataset_id: str, files: Sequence[FileAddress]) -> tuple[Upload, ...]:
-        """An upload for each address, whose bytes a dispatcher fetches; none where one of them cannot be.
+        """Create an upload for each address, for a dispatcher to fetch; none if one is refused.
 
         Raises as `create` does, and `InputError` (``address_refused``).
         """
@@ -216,7 +216,7 @@ class UploadStore(OwnedStore):
     async def content(self, upload: Upload) -> AsyncIterator[bytes]:
         """All bytes received, in order.
 
-        Raises `Conflict` (``upload_incomplete``) where the store has lost some, as after a restore.
+        Raises `Conflict` (``upload_incomplete``) if the store has lost some, as after a restore.
         """
         pieces = await self._database.fetch(
             "SELECT key, size FROM upload_pieces WHERE upload_id = %s ORDER BY start", upload.id
@@ -240,7 +240,7 @@ class UploadStore(OwnedStore):
 
     @contextlib.asynccontextmanager
     async def unpacking(self, upload_id: str | None) -> AsyncIterator[None]:
-        """Around the unpacking, which may take this process down: `InputError` if it took too many."""
+        """Wraps the unpacking, which may kill this process; raises `InputError` if it has killed too many."""
         try:
             async with counted(self._database, "uploads.losses", upload_id):
                 yield
@@ -250,9 +250,9 @@ class UploadStore(OwnedStore):
             raise InputError("validation_resources", detail, hint=hint) from None
 
     async def give_back(self, upload_id: str, token: uuid.UUID, *, failed: bool) -> None:
-        """Give the lease back; after a failure `not_imported` names the upload again after half of its age.
+        """Give the lease back. After a failure, `not_imported` lists the upload again after half of its age.
 
-        At the latest after a quarter of an hour; who asks for it may take it at once.
+        At the latest after 15 minutes; `take` by its id works at once.
         """
         await at_an_end(
             self._database,
@@ -309,7 +309,7 @@ class UploadStore(OwnedStore):
     async def expire(self) -> int:
         """Delete uploads that received nothing for ``upload_expiry_s``; returns how many.
 
-        One that could not be fetched, or stored once it was whole, is rejected first, so that its owner sees why.
+        One that could not be fetched or stored is rejected first, so that its owner sees why.
         """
         await self._give_up()
         rows = await self._database.fetch(
