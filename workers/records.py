@@ -17,23 +17,23 @@ from workers.database.ids import cursor_after, cursor_place, cursor_time
 
 PRIORITIES: dict[PriorityName, int] = {"low": -1, "normal": 0, "high": 1}
 
-# Files of a result that the engine knows.
+# Files of a result that the engine uses.
 LOG_NAME, POSES_NAME, REPORT_NAME = "log.txt", "poses.json", "report.json"
 CRASH_NAME = "crash.txt"  # beside the log, for the operator alone
 THUMBNAIL_NAME = "thumbnail.jpg"
-PREVIEW_FOLDER = "preview"  # of files that show how far a job is
+PREVIEW_FOLDER = "preview"  # of files that show a job's progress
 # What pages show of a dataset: beside the folder that is checked, and in the file store.
 SHOWN_FOLDER = "shown"
 PHOTO_LIST, PHOTO_SHEET, FIRST_PHOTO = "photos.json", "view/contact_sheet.jpg", "thumbnail.jpg"
 
 
 def shown_folder(checked: Path) -> Path:
-    """Where the check of the folder ``checked`` leaves what pages show."""
+    """The folder for what pages show of the set that is checked in ``checked``."""
     return checked.with_name(SHOWN_FOLDER)
 
 
 def shown_key(dataset_id: str) -> str:
-    """Where the store has the same."""
+    """The key of its copy in the file store."""
     return f"datasets/{dataset_id}/{SHOWN_FOLDER}"
 
 
@@ -56,7 +56,7 @@ class Artifact(ResultFile):
 
     @property
     def preview(self) -> bool:
-        """Whether it shows a job that is not over yet; a later preview replaces it."""
+        """Whether it is a preview of an unfinished job, which a later preview replaces."""
         return self.name.startswith(f"{PREVIEW_FOLDER}/")
 
 
@@ -90,7 +90,7 @@ def newest_first(cursor: str | None, limit: int) -> tuple[datetime | str | int |
 
 
 def page_of(found: Iterable[T], limit: int, order: tuple[str, ...] = ("created_at", "id")) -> Page[T]:
-    """The first ``limit`` of the records; where there are more, the cursor holds the last one's ``order`` fields."""
+    """The first ``limit`` of the records; if there are more, the cursor holds the last one's ``order`` fields."""
     items = tuple(found)
     shown = items[:limit]
     more = len(items) > limit

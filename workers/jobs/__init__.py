@@ -1,1 +1,1 @@
-"""The record of a job, and all SQL on it: submitted, listed, followed, claimed, reported on, ended, expired."""
+"""Job records and all SQL on them: submitting, listing, following, claiming, reporting, ending, expiring."""

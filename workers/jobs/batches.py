@@ -22,7 +22,7 @@ from workers.webhooks.webhooks import add_webhook
 
 
 class Batches(JobStore):
-    """The same jobs, many in one call."""
+    """The job store, extended by batches."""
 
     def __init__(self, jobs: JobStore) -> None:
         super().__init__(jobs._database, jobs._listener, jobs._settings)
@@ -77,8 +77,8 @@ class Batches(JobStore):
             return await self._view(connection, batch_id)
 
     async def cancel_batch(self, batch_id: str, *, keep_partial: bool = False) -> BatchView:
-        """Ask for the end of each of its jobs, as `cancel` does; raises `NotFound`."""
-        # One after the other: in one transaction each would hold its row while it waits for the next.
+        """Cancel each of its jobs, as `cancel` does; raises `NotFound`."""
+        # One by one: a single transaction would hold each row while it waits for the next.
         for job in (await self.batch(batch_id)).jobs:
             await self.cancel(job.id, keep_partial=keep_partial)
         return await self.batch(batch_id)
@@ -96,7 +96,7 @@ class Batches(JobStore):
 
 @contextmanager
 def _at(place: int) -> Iterator[None]:
-    """Adds which job of the request an error is about."""
+    """Adds to an error which job of the request it is about."""
     try:
         yield
     except FaultError as error:

@@ -1,4 +1,4 @@
-"""Claiming a job: from then on only the attempt that holds the token can write into it."""
+"""Claims a job: from then on, only the attempt that holds the token (the fence) can write into it."""
 
 from __future__ import annotations
 
@@ -45,18 +45,18 @@ class Claim:
 
     @property
     def name(self) -> str:
-        """Folder name of this attempt, never used by another one."""
+        """The attempt's folder name, unique among all attempts."""
         return f"{self.attempt}-{self.token.hex[:8]}"
 
 
 async def claim_job(
     database: Database, job_id: str, worker_id: int, max_attempts: int, stall_s: float
 ) -> Claim | None:
-    """Claim a job with a fresh token, for the worker that has its queue entry; none where there is nothing to run.
+    """Claim a job with a fresh token, for the worker that holds its queue entry; None if there is nothing to run.
 
-    A worker that was taken for dead and woke up finds the entry in the queue again, or with another worker.
-    A job whose cancellation was asked for ends ``cancelled``, one that has used up its attempts ends ``failed``, one
-    beyond its time as `end_overdue` says.
+    A worker that wakes up after it counted as dead finds the entry back in the queue, or held by another worker. A job
+    whose cancellation was requested ends ``cancelled``, one that has used up its attempts ``failed``, and an overdue
+    one as `end_overdue` says.
     """
     token = uuid.uuid4()
     return await retry_while_unavailable(
@@ -71,17 +71,17 @@ async def _claim(
         sql = f"SELECT *, {OVERDUE} AS overdue FROM jobs WHERE id = %s FOR UPDATE"
         row = await connection.row(sql, job_id)
         if row is not None and row["run_token"] == token:
-            # An earlier try got through, though its acknowledgement was lost: the attempt counts once.
+            # An earlier try was committed and only its acknowledgement lost: the attempt counts once.
             return _claimed(row, token)
         if row is None or row["state"] not in ("queued", "running"):
             return None
         if not await job_queue.lock_taken(connection, row["queue_id"], worker_id):
             return None
-        if row["state"] == "running":  # the end of its last attempt was never written
+        if row["state"] == "running":  # the end of its last attempt was never recorded
             await drop_token(connection, job_id)
         if row["overdue"] and not row["cancel_requested"]:
             await end_overdue(connection, row, stall_s)
-        # Nobody runs it, though the row may say so.
+        # No worker runs it, even if the row says so.
         if row["cancel_requested"] or (row["overdue"] and row["state"] == "running"):
             await finish_cancelled(connection, job_id, stall_s)
         if row["cancel_requested"] or row["overdue"]:
@@ -104,7 +104,7 @@ async def cancel_requested(database: Database, job_id: str) -> bool:
 
 
 async def input_bytes(database: Database, job_id: str) -> int:
-    """Size of the files that an attempt stages."""
+    """The size of the files that an attempt stages."""
     (row,) = await database.fetch(
         "SELECT coalesce(sum(file.size), 0)::bigint AS bytes FROM jobs"
         " JOIN dataset_files AS file ON file.dataset_id = jobs.dataset_id WHERE jobs.id = %s",
@@ -114,7 +114,7 @@ async def input_bytes(database: Database, job_id: str) -> int:
 
 
 async def published_files(database: Database, job_id: str) -> list[tuple[str, str]]:
-    """Key and name of each file of a job's result; raises `NotFound`."""
+    """The key and name of each file of a job's result; raises `NotFound`."""
     rows = await database.fetch("SELECT artifacts FROM jobs WHERE id = %s", job_id)
     if not rows:
         raise NotFound(f"No job {job_id}.")

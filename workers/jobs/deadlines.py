@@ -1,4 +1,4 @@
-"""Deadlines of jobs: set at the submission, kept by the janitor and by whoever claims a job.
+"""Deadlines of jobs: set at submission, enforced by the janitor and when a job is claimed.
 
 The clock is the database's.
 """
@@ -16,20 +16,20 @@ from workers.database import job_queue
 from workers.database.database import Connection
 from workers.jobs.job_states import finish, request_cancel
 
-# Of an unfinished job. Once it has started, its deadline alone counts.
+# For unfinished jobs. After the start, only the deadline counts.
 OVERDUE = "(start_by <= clock_timestamp() AND (started_at IS NULL OR deadline_at <= clock_timestamp()))"
 MOST_AT_ONCE = 200
 
 
 async def limit_columns(connection: Connection, asked: JobTexts) -> dict[str, datetime | None]:
-    """Columns of a job that is submitted now, with its limits of time.
+    """The columns with the time limits of a job that is submitted now.
 
     Raises `InputError` (``deadline_refused``) for a deadline that has passed, or is too far ahead.
     """
     if asked.expires_in_queue_s is None and asked.deadline_at is None:
         return {}
     row = await connection.only_row(
-        # No time comes back that has no year in Python.
+        # Python cannot represent some of PostgreSQL's times, so none of them is returned.
         "SELECT greatest(now, least(deadline, now + make_interval(secs => %s))) AS start_by,"
         " deadline <= now AS passed, deadline > now + make_interval(secs => %s) AS far, now"
         " FROM (SELECT clock_timestamp() AS now, %s::timestamptz AS deadline) AS at",
@@ -46,9 +46,9 @@ async def limit_columns(connection: Connection, asked: JobTexts) -> dict[str, da
 
 
 async def end_overdue_jobs(connection: Connection, stall_s: float) -> list[str]:
-    """End what waits or runs beyond its time, at most `MOST_AT_ONCE` jobs; returns which."""
+    """End at most `MOST_AT_ONCE` overdue jobs, waiting or running; returns their ids."""
     overdue = await connection.rows(
-        # By now() first, for which there is an index.
+        # Compare with now() first, which can use the index.
         "SELECT * FROM jobs WHERE state IN ('queued', 'running') AND start_by <= now()"
         f" AND NOT cancel_requested AND {OVERDUE} ORDER BY start_by LIMIT %s FOR UPDATE SKIP LOCKED",
         MOST_AT_ONCE,
@@ -59,10 +59,10 @@ async def end_overdue_jobs(connection: Connection, stall_s: float) -> list[str]:
 
 
 async def end_overdue(connection: Connection, job: Mapping[str, Any], stall_s: float) -> None:
-    """End an unfinished job beyond its time, whose row the caller has locked.
+    """End an overdue job, whose row the caller has locked.
 
-    One that never started ends as expired. Any other one is stopped as on request, and keeps its best poses so far, if
-    it has shown any: a running one by its worker, one that waits again for a worker at once.
+    One that never started expires. Any other is cancelled and keeps its best poses so far, if it has published any: a
+    running one through its worker, a requeued one at once.
     """
     if job["started_at"] is None:
         await job_queue.cancel(connection, job["queue_id"])

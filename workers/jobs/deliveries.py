@@ -1,4 +1,4 @@
-"""Files of jobs that are sent to addresses of their owners: requests and their outcomes."""
+"""Files of jobs to be sent to their owners' addresses: requests and outcomes."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from workers.database.ids import new_id
 from workers.settings.settings import Settings
 from workers.webhooks.outbound import Policy, checked_url
 
-# Of which jobs files are due, for rows `work` of job_deliveries.
+# Selects the rows `work` of job_deliveries whose jobs have ended.
 DUE = "JOIN jobs ON jobs.id = work.job_id WHERE jobs.state NOT IN ('queued', 'running')"
 
 
 async def lock_for_delivery(connection: Connection, job_id: str) -> None:
-    """The job first, then its deliveries: who deletes it locks them in this order."""
+    """Lock the job before its deliveries, the order in which a deletion locks them."""
     await connection.execute("SELECT 1 FROM jobs WHERE id = %s FOR NO KEY UPDATE", (job_id,))
 
 
 async def add_deliveries(connection: Connection, settings: Settings, job_id: str, to: DeliverTo) -> None:
-    """Have files of a job, whose row is locked, sent once it is over; a new address replaces the one before.
+    """Schedule files of a job, whose row is locked, to be sent after its end; a new address replaces the old one.
 
     Raises `InputError` (``address_refused``).
     """
@@ -48,7 +48,7 @@ async def add_deliveries(connection: Connection, settings: Settings, job_id: str
 async def note_delivery(
     connection: Connection, job_id: str, name: str | None, host: str, error: JobError | None
 ) -> None:
-    """Write down that a file was delivered, or why not; the job itself stays as it is."""
+    """Record that a file was delivered, or why not; changes nothing else of the job."""
     state = "delivered" if error is None else "failed"
     note = DeliveredFile(name=name, host=host, state=state, at=datetime.now(UTC), error=error)
     await _note(connection, job_id, note)

@@ -25,12 +25,12 @@ from workers.store.trash import discard, rescue
 
 NORMAL = PRIORITIES["normal"]
 LATEST_FIRST = REUSABLE_STAGES[::-1]
-# Of a fork that never came to be; long after any request has ended.
+# When copies for a fork that was never created are deleted; far longer than a request takes.
 ABANDONED_S = 3600
 
 
 class DerivedJobs(JobStore):
-    """The same jobs, and how to derive others from them. Every method raises `NotFound` as well."""
+    """The job store, extended by derived jobs. Every method raises `NotFound` as well."""
 
     def __init__(self, jobs: JobStore, files: FileStore) -> None:
         super().__init__(jobs._database, jobs._listener, jobs._settings)
@@ -45,9 +45,9 @@ class DerivedJobs(JobStore):
         labels: Mapping[str, str] | None = None,
         idempotency_key: str | None = None,
     ) -> tuple[JobView, bool]:
-        """Queue a job on the same dataset with other options, that takes over a stage's work.
+        """Queue a job on the same dataset with other options, reusing a stage's work.
 
-        It has its own copy of that work, so that either job can be deleted. Returns the job and whether it is
+        It gets its own copy of that work, so that either job can be deleted. Returns the job and whether it is
         new (False: the same key with the same request came before).
         Raises `Conflict` (``fork_not_possible``, ``dataset_not_ready``, ``idempotency_key_reused``),
         `InputError` (``invalid_options``), `LimitReached` (``queue_full``).
@@ -61,7 +61,7 @@ class DerivedJobs(JobStore):
             options, stage = plan_fork(parent, changes, wanted)
             asked = asked_columns(options)
             fingerprint = fingerprint_of(f"fork {job_id} {stage}", options.model_dump(mode="json"), labels)
-            # Before anything is copied, which no quota counts until the fork is there.
+            # Checked before copying: no quota counts the copies until the fork exists.
             known = await self._existing_after_quota(connection, parent, idempotency_key, fingerprint)
             if known is not None:
                 return known, False
@@ -91,7 +91,7 @@ class DerivedJobs(JobStore):
         idempotency_key: str | None,
         fingerprint: str,
     ) -> JobView | None:
-        """The job of an earlier request with this key; none where there is room for a new one."""
+        """The job of an earlier request with this key, else None; raises if there is no room for a new one."""
         await submitting_for(connection, {parent["dataset_id"]}, self._tenant)
         if idempotency_key is not None:
             known = await known_job(connection, parent["tenant"], idempotency_key, fingerprint)
@@ -103,7 +103,7 @@ class DerivedJobs(JobStore):
     async def _copied(
         self, reusable: Mapping[str, Any], stage: ReusableStage, fork_id: str
     ) -> dict[str, Any]:
-        """The work of a stage and those before it, copied for the fork; trash until the fork is there."""
+        """Copy the work of a stage and those before it for the fork; it is trash until the fork exists."""
         async with self._database.transaction() as connection:
             await discard(connection, f"jobs/{fork_id}", after_s=ABANDONED_S)
         copied: dict[str, Any] = {}
@@ -119,7 +119,7 @@ class DerivedJobs(JobStore):
     async def export(
         self, job_id: str, formats: Sequence[ExportName], poses_of: PosesOf = "camera"
     ) -> tuple[JobView, bool]:
-        """Queue an export of the job's result in further forms; the same request finds the same export.
+        """Queue an export of the job's result in more formats; the same request returns the same export.
 
         Raises `Conflict` (``result_not_ready``; ``state_conflict``: there are no poses to export),
         `LimitReached` (``queue_full``).
@@ -169,7 +169,7 @@ class DerivedJobs(JobStore):
 def plan_fork(
     parent: Mapping[str, Any], changes: Mapping[str, Any], wanted: WantedStage
 ) -> tuple[RefineOptions, ReusableStage]:
-    """Options of the fork, and the latest stage that it can take over.
+    """The options of the fork, and the latest stage that it can reuse.
 
     Args:
         parent: the row of the forked job.
@@ -180,10 +180,10 @@ def plan_fork(
         Conflict: ``fork_not_possible``, with the reason.
         InputError: ``invalid_options``.
     """
-    # Sizes that ran out of memory would do so again.
+    # The larger sizes would run out of memory again.
     asked = {**parent["options"], **parent["smaller"]}
     options = parse_options({**asked, **changes})
-    # Without resolved options the job has not run, and there is nothing to take over on any device.
+    # Without resolved options the job has not run, and there is nothing to reuse on any device.
     device = (parent["resolved_options"] or {}).get("device", "cpu")
     old = parse_options(asked).resolved(device).model_dump()
     new = options.resolved(device if options.device == "auto" else options.device).model_dump()

@@ -1,6 +1,6 @@
-"""What is kept of ended jobs, and for how long. Each function runs in the caller's transaction.
+"""Expiry of ended jobs and their data. Each function runs in the caller's transaction.
 
-Dates are compared with now(): no index is of use for clock_timestamp(), which may change from row to row.
+Dates are compared with now(): clock_timestamp() is volatile, so it cannot use an index.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ FORGET_CHECKPOINTS = "UPDATE jobs SET checkpoint = NULL WHERE checkpoint ->> 'pr
 
 
 async def date_jobs(connection: Connection, kept_s: float | None) -> None:
-    """Set the dates of expiry of all jobs: ``kept_s`` after the end of each, or none."""
+    """Set the expiry dates of all jobs: ``kept_s`` after the end of each, or none."""
     await connection.execute(
         "UPDATE jobs SET expires_at = finished_at + make_interval(secs => %s)"
         " WHERE finished_at IS NOT NULL AND state <> 'expired'"
@@ -29,7 +29,7 @@ async def date_jobs(connection: Connection, kept_s: float | None) -> None:
 
 
 async def date_new_jobs(connection: Connection, kept_s: float | None) -> None:
-    """Set the dates of jobs that ended since the last time."""
+    """Set the expiry dates of jobs that ended since the last call."""
     if kept_s is not None:
         await connection.execute(
             "UPDATE jobs SET expires_at = finished_at + make_interval(secs => %s)"
@@ -39,7 +39,7 @@ async def date_new_jobs(connection: Connection, kept_s: float | None) -> None:
 
 
 async def datasets_used_since(connection: Connection, since: datetime) -> list[str]:
-    """Datasets of which a job was submitted or ended."""
+    """Datasets with a job that was submitted or ended after ``since``."""
     rows = await connection.rows(
         "SELECT dataset_id FROM jobs WHERE created_at > %s"
         " UNION SELECT dataset_id FROM jobs WHERE finished_at > %s",
@@ -78,7 +78,7 @@ async def expire_jobs(connection: Connection, limit: int) -> int:
 
 
 async def drop_left_checkpoints(connection: Connection, stall_s: float) -> None:
-    """Ended jobs need no checkpoint; versions before 007 left it in their rows, and sometimes its files."""
+    """Drop checkpoints of ended jobs: versions before 007 left them in rows, and sometimes their files."""
     left = await connection.rows(
         "UPDATE jobs SET checkpoint = NULL WHERE checkpoint IS NOT NULL AND state NOT IN ('queued', 'running')"
         " RETURNING id"
@@ -88,7 +88,7 @@ async def drop_left_checkpoints(connection: Connection, stall_s: float) -> None:
 
 
 async def forget_keys(connection: Connection, kept_s: float) -> None:
-    """Idempotency keys of jobs and batches that ended so long ago can be used again."""
+    """Release the idempotency keys of jobs and batches that ended so long ago."""
     for sql in ("UPDATE jobs SET idempotency_key = NULL", "UPDATE batches SET idempotency_key = NULL"):
         await connection.execute(
             f"{sql} WHERE idempotency_key IS NOT NULL AND finished_at < now() - make_interval(secs => %s)",

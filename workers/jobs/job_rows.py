@@ -1,4 +1,4 @@
-"""Rows of the table `jobs`: as the record that clients see, found again by a key, with files to be sent."""
+"""Rows of the table `jobs`: public records, idempotency keys, and checks of their files."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ JOB = """
             AND (ahead.queue_order, ahead.queue_id) <= (jobs.queue_order, jobs.queue_id))
         END AS queue_position
     FROM jobs"""
-# The same for many at once: counting for each job takes seconds where thousands wait.
+# The same for many jobs at once: counting for each takes seconds if thousands wait.
 PLACES = """places AS (SELECT queue_id, row_number() OVER (PARTITION BY kind ORDER BY queue_order, queue_id)
     AS queue_position FROM jobs WHERE state = 'queued')"""
 WHOLE_RESULT = ("poses.json", "report.json", "colmap/sparse/0/cameras.bin", "colmap/sparse/0/images.bin")
-# With the store's tenant as parameter; none for all tenants.
+# The parameter is the store's tenant; None for all tenants.
 MINE = "jobs.tenant = coalesce(%s, jobs.tenant)"
 
 
@@ -42,7 +42,7 @@ def job_from_row(row: dict[str, Any]) -> JobView:
 
 
 def require_files(row: Mapping[str, Any]) -> None:
-    """Raises `Expired` for a job whose files are gone. One that had not started in time never had any."""
+    """Raises `Expired` if the job's files were deleted. A job that expired in the queue never had any."""
     if row["state"] == "expired" and row["started_at"] is not None:
         raise Expired(f"The files of job {row['id']} were kept for their time and are gone.")
 
@@ -68,7 +68,7 @@ def _thumbnail(row: dict[str, Any]) -> str | None:
 
 
 def asked_columns(options: RefineOptions) -> dict[str, Any]:
-    """Columns of a new job that follow from its options.
+    """The columns of a new job that follow from its options.
 
     Raises `InputError` (``invalid_options``) if they contradict the values of preset and method.
     """
@@ -77,19 +77,19 @@ def asked_columns(options: RefineOptions) -> dict[str, Any]:
 
 
 async def jobs_of_dataset(connection: Connection, dataset_id: str) -> list[str]:
-    """Id and state of each job on the dataset, to show."""
+    """The id and state of each job on the dataset, as text."""
     jobs = await connection.rows("SELECT id, state FROM jobs WHERE dataset_id = %s", dataset_id)
     return [f"{job['id']} ({job['state']})" for job in jobs]
 
 
 def fingerprint_of(subject: str, options: Mapping[str, Any], labels: Mapping[str, str] | None = None) -> str:
-    """A digest of a request: two requests with one idempotency key are the same where these are equal."""
+    """A digest of a request, which tells whether two requests with one idempotency key are the same."""
     request = json.dumps([subject, dict(options), dict(labels or {})], sort_keys=True)
     return hashlib.sha256(request.encode()).hexdigest()
 
 
 def submission_fingerprint(subject: str, asked: JobTexts) -> str:
-    """That of a submission, whose input is ``subject``: the dataset, or the digest of what was sent.
+    """The fingerprint of a submission; ``subject`` is its dataset, or the digest of what was sent.
 
     Signed addresses differ each time, so they are not compared.
     """
@@ -100,7 +100,7 @@ def submission_fingerprint(subject: str, asked: JobTexts) -> str:
 async def known_job(
     connection: Connection, tenant: str, idempotency_key: str, fingerprint: str
 ) -> JobView | None:
-    """The job of an earlier request with this key; raises `Conflict` where that was a different one."""
+    """The job of an earlier request with this key; raises `Conflict` if that was a different one."""
     row = await connection.row(JOB + " WHERE tenant = %s AND idempotency_key = %s", tenant, idempotency_key)
     if row is not None and row["fingerprint"] != fingerprint:
         raise Conflict("idempotency_key_reused", f"The key was used for another request ({row['id']}).")

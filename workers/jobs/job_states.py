@@ -37,7 +37,7 @@ async def add_event(
 
 
 async def insert_job(connection: Connection, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Write a new job, ``values`` by column; `queue_job` is given what this returns."""
+    """Insert a new job, ``values`` by column; pass the returned row to `queue_job`."""
     row = {**values, "trace": traceparent()}
     statement = sql.SQL("INSERT INTO jobs ({}) VALUES ({}) RETURNING id, kind, queue_order, held").format(
         sql.SQL(", ").join(map(sql.Identifier, row)), sql.SQL(", ").join([sql.Placeholder()] * len(row))
@@ -59,7 +59,7 @@ async def _enqueue(connection: Connection, job: Mapping[str, Any]) -> None:
 
 
 async def start_attempt(connection: Connection, job_id: str, token: uuid.UUID) -> dict[str, Any]:
-    """Begin one more attempt, which owns the job from now on; returns the row."""
+    """Start a new attempt, which then owns the job; returns the row."""
     row = await connection.only_row(
         "UPDATE jobs SET state = 'running', attempt = attempt + 1, run_token = %s, fraction = 0,"
         " slot_kind = (SELECT slots.kind FROM queue_entries AS entry JOIN slots USING (worker_id)"
@@ -75,19 +75,19 @@ async def start_attempt(connection: Connection, job_id: str, token: uuid.UUID) -
 
 
 async def drop_token(connection: Connection, job_id: str) -> None:
-    """Whoever ran the job can write no more, and its attempt counts until it was last seen."""
+    """Fence the current attempt: it can write no more, and its use counts until it was last seen."""
     await connection.execute("UPDATE jobs SET run_token = NULL WHERE id = %s", (job_id,))
 
 
 @dataclass(frozen=True)
 class Requeue:
-    """Why a job goes back to the queue, as an event, and with what changes.
+    """Why a job goes back to the queue: the event, and what changes.
 
     Attributes:
-        setback: what ended the attempt; None where nothing went wrong, and then the attempt does not count.
-        fence: drop the token, so that the attempt that ran it can write no more.
+        setback: what ended the attempt; None if nothing went wrong: then the attempt does not count.
+        fence: drop the token, so that the old attempt can write no more.
         forget_checkpoint: start over.
-        smaller: options that later attempts use in the place of those asked for.
+        smaller: options that later attempts use in place of the requested ones.
     """
 
     event: EventType
@@ -101,7 +101,7 @@ class Requeue:
 async def requeue(connection: Connection, job_id: str, how: Requeue) -> None:
     """Set the job back to queued. The caller puts its queue entry back.
 
-    A setback counts only where an attempt was running: not before one began, nor after it gave the job back itself.
+    A setback counts only if an attempt was running: not before it began or after it gave the job back.
     """
     setback = None if how.setback is None else SETBACKS[how.setback]
     counts = setback and setback.counts
@@ -134,18 +134,18 @@ async def say_what_it_waits_for(connection: Connection, job_id: str, cause: Caus
 
 
 async def take_back(connection: Connection, entry_id: int, stall_s: float) -> None:
-    """Take a queue entry from a worker that is gone.
+    """Take a queue entry back from a dead worker.
 
-    The job goes back to the queue (its attempt stays counted); one that should be cancelled, or is final
-    already, leaves the queue. The token is dropped, so a worker that was only asleep is fenced from here on.
+    The job is requeued (its attempt stays counted); a cancelled or final one leaves the queue. The token is dropped, so
+    a worker that was only suspended is fenced.
     """
-    job = await connection.row(  # of unfinished jobs there is an index
+    job = await connection.row(  # only unfinished jobs are indexed
         "SELECT id, cancel_requested FROM jobs"
         " WHERE queue_id = %s AND state IN ('queued', 'running') FOR UPDATE",
         entry_id,
     )
     if not await job_queue.lock_taken(connection, entry_id, None):
-        return  # it came to an end in the meantime
+        return  # the entry has ended meanwhile
     if job is None:  # or final
         await job_queue.abort(connection, entry_id)
         return
@@ -162,7 +162,7 @@ async def take_back(connection: Connection, entry_id: int, stall_s: float) -> No
 
 
 async def requeue_lost(connection: Connection, silent_s: float) -> None:
-    """Queue unfinished jobs again whose queue entry is gone, if they have not changed for ``silent_s``."""
+    """Requeue unfinished jobs whose queue entry is gone, if they have not changed for ``silent_s``."""
     for job in await connection.rows(
         "SELECT jobs.id, jobs.kind, jobs.queue_order, jobs.held"
         " FROM jobs LEFT JOIN queue_entries AS entry ON entry.id = jobs.queue_id"
@@ -177,7 +177,7 @@ async def requeue_lost(connection: Connection, silent_s: float) -> None:
 
 
 async def offer_held_jobs(connection: Connection) -> None:
-    """Offer held jobs as far as limits allow. Ends of jobs do so by themselves; this is for limits that changed."""
+    """Offer held jobs as far as limits allow. The end of a job does so anyway; call this after limits changed."""
     await connection.execute(
         "SELECT offer_held(tenant)"
         " FROM (SELECT DISTINCT tenant FROM jobs WHERE held AND state = 'queued') AS waiting"
@@ -192,9 +192,9 @@ async def request_cancel(
     stall_s: float,
     why: JobError | None = None,
 ) -> None:
-    """Cancel a queued job, or ask its worker to. Does nothing where that was requested before, or the job is over.
+    """Cancel a queued job, or ask its worker to. Does nothing if that was requested before or the job has ended.
 
-    ``why`` becomes its error; none where its user asks.
+    ``why`` becomes its error; None if its user asks.
     """
     job = await connection.row(
         "UPDATE jobs SET cancel_requested = true, keep_partial = %s, error = %s"
@@ -205,14 +205,14 @@ async def request_cancel(
     if job is None:
         return
     await job_queue.cancel(connection, job["queue_id"])
-    if job["state"] == "queued":  # perhaps after an attempt that has shown something
+    if job["state"] == "queued":  # maybe after an attempt that published previews
         await finish_cancelled(connection, job_id, stall_s)
     else:
         await add_event(connection, job_id, "cancel_requested", {"code": why.code} if why else {})
 
 
 async def delete_job(connection: Connection, job_id: str) -> None:
-    """Delete a final job; its exports, and the files of all, go with it."""
+    """Delete a final job with its exports and all their files."""
     await connection.execute("DELETE FROM jobs WHERE id = %s", (job_id,))
     await connection.execute("SELECT pg_notify('biresnerf_jobs', %s)", (job_id,))
 
@@ -226,7 +226,7 @@ async def finish(
     *,
     partial: bool = False,
 ) -> None:
-    """Write the end and its event. Previews and checkpoints are over; `trash_attempts` has their files deleted."""
+    """Record the end of a job, and its event. Drops previews and checkpoints; `trash_attempts` deletes their files."""
     await connection.execute(
         "UPDATE jobs SET state = %s, error = %s, artifacts = %s, finished_at = clock_timestamp(),"
         " eta_s = NULL, fraction = CASE WHEN %s = 'succeeded' THEN 1 ELSE fraction END,"
@@ -254,12 +254,12 @@ async def finish_cancelled(
     artifacts: Sequence[Artifact] = (),
     keep: str | None = None,
 ) -> None:
-    """End a job on request, or at its deadline, with the files that are wanted: all there are, or the log alone.
+    """End a job on request or at its deadline, keeping the files that are wanted: all, or the log alone.
 
-    Where a partial result is wanted and the process did not come to write one, the last preview is it.
+    If a partial result is wanted but was not written, the last preview takes its place.
 
     Args:
-        stall_s: how long a worker may be silent; nothing is deleted before twice that.
+        stall_s: how long a worker may be silent; files are deleted after twice that.
         artifacts: what the attempt could store.
         keep: the attempt's name.
     """
@@ -279,7 +279,7 @@ async def finish_cancelled(
 
 
 def _is_whole(artifacts: Sequence[Artifact]) -> bool:
-    """Whether there are poses and the report on them, which is written last: a process may have been killed between."""
+    """Whether there are poses and a report. The report is written last, so a killed process may lack it."""
     return {POSES_NAME, REPORT_NAME} <= {item.name for item in artifacts}
 
 
@@ -291,9 +291,9 @@ async def trash_attempts(
     *,
     preview: str | None = None,
 ) -> None:
-    """Give to the trash what attempts left.
+    """Move to the trash what attempts left.
 
-    The results of ``keep``, the preview named ``preview`` and the stages' work that the job records stay.
+    Keeps the results of ``keep``, the preview named ``preview``, and the stages' work that the job records.
     """
     row = await connection.only_row("SELECT reusable FROM jobs WHERE id = %s", job_id)
     kept = {"checkpoints": None, "results": keep, "previews": preview}

@@ -1,4 +1,4 @@
-"""Shares one poll among all subscribers of jobs, and one read among all subscribers of the same job."""
+"""Lets all subscribers of jobs share one poll, and all subscribers of the same job one read."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class JobListener(Listener):
         self._reads: dict[tuple[object, ...], asyncio.Task[JobUpdate]] = {}
 
     async def run(self) -> None:
-        """Listen and look until cancelled."""
+        """Listen and poll until cancelled."""
         await asyncio.gather(super().run(), self._look())
 
     async def read_shared(
@@ -37,7 +37,7 @@ class JobListener(Listener):
         after: int,
         read: Callable[[str, int], Awaitable[JobUpdate]],
     ) -> JobUpdate:
-        """The answer of ``read``, shared with all requests of the same ``viewer`` for the same since the last change.
+        """The result of ``read``, shared by equal requests of the same ``viewer`` since the job's last change.
 
         Call it only while `waiting` for the job: a change during the read then wakes the caller again.
         """
@@ -51,7 +51,7 @@ class JobListener(Listener):
     def _has_read(self, key: tuple[object, ...], reading: asyncio.Task[JobUpdate]) -> None:
         del self._reads[key]
         if not reading.cancelled():
-            reading.exception()  # marks it as retrieved: all who asked may have left
+            reading.exception()  # marks it as retrieved: all callers may have left
 
     def _wake(self, job_id: str) -> None:
         if job_id in self._waiting:
@@ -92,7 +92,7 @@ async def follow(
     revision, sent_at = -1, time.monotonic()
     with listener.waiting(job_id) as changed:
         while True:
-            changed.clear()  # before reading: a change during the read is not missed
+            changed.clear()  # before reading, so that a change meanwhile is not missed
             try:
                 update = await listener.read_shared(viewer, job_id, after, read)
                 pause_s = heartbeat_s

@@ -1,4 +1,4 @@
-"""The job record: submit, look, cancel, delete, follow. Used by the service; never loads torch."""
+"""Job records: submit, read, cancel, delete, follow. For the service; never loads torch."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class JobStore(OwnedStore):
         self._key_id: str | None = None
 
     def for_tenant(self, tenant: str | None, key_id: str | None = None) -> Self:
-        """The store limited to the tenant; new jobs are noted as submitted with this key."""
+        """The store limited to the tenant; records this key on new jobs."""
         bound = super().for_tenant(tenant)
         bound._key_id = key_id
         return bound
@@ -101,7 +101,7 @@ class JobStore(OwnedStore):
             return job_from_row(await self._required(connection, job_id)), True
 
     async def _add(self, connection: Connection, asked: NewJob, columns: Mapping[str, Any]) -> str:
-        """The id of a new job in the queue, with these further columns; see `submit`."""
+        """Insert and queue a job with these further columns; returns its id. See `submit`."""
         if asked.fixed_from is not None:
             require_result(await self._required(connection, asked.fixed_from))
         priority = PRIORITIES[asked.priority]
@@ -124,7 +124,7 @@ class JobStore(OwnedStore):
             await add_webhook(connection, self._settings, columns["tenant"], hook, hook.events, job_id=job_id)
         if asked.deliver is not None:
             await add_deliveries(connection, self._settings, job_id, asked.deliver)
-        await queue_job(connection, added)  # an event that the webhook is to get
+        await queue_job(connection, added)  # the webhook gets this event
         return job_id
 
     async def repeated(
@@ -133,9 +133,9 @@ class JobStore(OwnedStore):
         asked: JobTexts,
         idempotency_key: str,
     ) -> JobView | None:
-        """The job of an earlier request with this key, before anything is done for this one.
+        """The job of an earlier request with this key, to check before any other work.
 
-        Raises `Conflict` (``idempotency_key_reused``) where the earlier request was a different one.
+        Raises `Conflict` (``idempotency_key_reused``) if the earlier request was a different one.
         """
         fingerprint = submission_fingerprint(request_digest, asked)
         async with self._database.transaction() as connection:
@@ -171,7 +171,7 @@ class JobStore(OwnedStore):
         return page_of(map(job_from_row, rows), limit)
 
     async def deliver(self, job_id: str, to: DeliverTo) -> JobView:
-        """Have files of the job sent, now or once it is over; a new address replaces the one before.
+        """Send files of the job, now or once it has ended; a new address replaces the old one.
 
         Raises `NotFound`, `Expired`, `Conflict` (``state_conflict``: an export), `InputError` (``address_refused``).
         """
@@ -185,10 +185,10 @@ class JobStore(OwnedStore):
             return job_from_row(await self._required(connection, job_id))
 
     async def cancel(self, job_id: str, *, keep_partial: bool = False) -> JobView:
-        """Ask for the end of a job: a queued one is cancelled at once, a running one within seconds.
+        """Cancel a job: a queued one at once, a running one within seconds.
 
-        With ``keep_partial`` the best poses so far are published, with a report that says that they are
-        partial. The first request decides. A job already final is returned as it is. Raises `NotFound`.
+        With ``keep_partial`` the best poses so far are published, with a report that marks them as partial. The first
+        request decides. A final job is returned unchanged. Raises `NotFound`.
         """
         async with self._database.transaction() as connection:
             await request_cancel(connection, job_id, self._tenant, keep_partial, self._settings.stall_s)
@@ -224,7 +224,7 @@ class JobStore(OwnedStore):
             )
         listed = [*own["artifacts"], *(own["previews"] or {}).get("artifacts", [])]
         listed += [item for row in exports for item in row["artifacts"] if item["name"] != LOG_NAME]
-        # A form that the job wrote itself may have been exported as well: the files are the same.
+        # A format of the result may have been exported as well; the files are the same.
         named = {item["name"]: item for item in reversed(listed)}
         return tuple(Artifact.model_validate(named[name]) for name in sorted(named))
 
@@ -237,7 +237,7 @@ class JobStore(OwnedStore):
             return tuple(map(LogLine.model_validate, rows))
 
     async def update(self, job_id: str, after: int = 0) -> JobUpdate:
-        """The job and the events after ``after``, seen in one snapshot; raises `NotFound`."""
+        """The job and the events after ``after``, read in one snapshot; raises `NotFound`."""
         async with self._database.transaction() as connection:
             await connection.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ")
             job = job_from_row(await self._required(connection, job_id))
@@ -248,14 +248,14 @@ class JobStore(OwnedStore):
     ) -> AsyncGenerator[JobUpdate | None]:
         """Follow a job: first its state and the events after ``after``, then every change.
 
-        Yields none when nothing changed for ``heartbeat_s`` (time for a keep-alive). Ends after the update
+        Yields None when nothing changed for ``heartbeat_s`` (time for a keep-alive). Ends after the update
         that carries a final state. Progress is in ``update.job``, at most once a second. Survives a restart
         of the database. Raises `NotFound`, also when the job is deleted meanwhile.
         """
         return follow(self.update, self._listener, self._tenant, job_id, after, heartbeat_s)
 
     async def wait(self, job_id: str, *, timeout_s: float) -> JobView:
-        """The job as soon as it is final, or as it is after ``timeout_s`` (for long polls)."""
+        """The job as soon as it is final, or else after ``timeout_s`` (for long polls)."""
         job = await self.get(job_id)
         updates = follow(self.update, self._listener, self._tenant, job_id, 0, timeout_s)
         with contextlib.suppress(TimeoutError):

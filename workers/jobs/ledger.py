@@ -1,7 +1,7 @@
-"""What a running attempt writes into its job, each write fenced by the attempt's token.
+"""The writes of a running attempt into its job, each fenced by the attempt's token.
 
-Of two processes that believe they run a job (one was frozen and taken for dead), only the one that claimed
-last can write. The other gets `Fenced` and must leave without touching the queue.
+If two processes believe that they run a job (one was frozen and counted as dead), only the later claim can write. The
+other gets `Fenced` and must exit without touching the queue.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from workers.process.waiting import retry_while_unavailable
 from workers.records import LOG_NAME, Artifact
 from workers.store.trash import discard
 
-PREVIEW_KEPT_S = 60.0  # after another one took its place: it may be on its way to somebody
+PREVIEW_KEPT_S = 60.0  # after it was replaced: it may be downloading
 LOG_LINES_MAX = 20_000  # of one job
-EVENTS_MAX = 10_000  # of one job, but for those of its attempts and its end, which are few
+EVENTS_MAX = 10_000  # of one job, except those of attempts and the end, which are few
 _LOCKED = """
     SELECT id, run_token, state, stage, cancel_requested, keep_partial, log_lines, checkpoint, reusable, previews,
     crashes, seq
@@ -40,10 +40,10 @@ _Fenced: TypeAlias = Callable[Concatenate["Ledger", P], Coroutine[Any, Any, T]]
 
 
 def _fenced(done: Callable[[DictRow], T]) -> Callable[[_Write[P, T]], _Fenced[P, T]]:
-    """Runs a method of `Ledger` under the job's row lock, with the row, if the token still holds.
+    """Runs a method of `Ledger` with the job's row, locked, if the token is still valid.
 
-    While the database is away it waits. ``done`` is the answer where an earlier try ended the attempt, though its
-    acknowledgement was lost; it is given the row.
+    Waits while the database is away. ``done`` gives the answer, from the row, if an earlier try ended the attempt and
+    only its acknowledgement was lost.
     """
 
     def decorate(write: _Write[P, T]) -> _Fenced[P, T]:
@@ -76,7 +76,7 @@ def _not_cancelled(job: DictRow) -> bool:
 class Ledger:
     """The fenced writes of one attempt. Every method raises `Fenced`.
 
-    Files of other attempts are deleted once no process can still be writing them: after twice ``stall_s``.
+    Other attempts' files are deleted after twice ``stall_s``, when no process can still write them.
     """
 
     def __init__(self, database: Database, claim: Claim, stall_s: float) -> None:
@@ -85,7 +85,7 @@ class Ledger:
 
     @_fenced(_nothing)
     async def progress(self, connection: Connection, job: DictRow, now: Progress) -> None:
-        """Write the progress columns, and the options where they are reported; a new stage is also an event."""
+        """Write the progress columns, and options if reported; a new stage is also an event."""
         resolved = None if now.options is None else Jsonb(now.options.model_dump(mode="json"))
         await connection.execute(
             "UPDATE jobs SET stage = %(stage)s, fraction = greatest(fraction, %(fraction)s), step = %(step)s,"
@@ -101,7 +101,7 @@ class Ledger:
 
     @_fenced(_nothing)
     async def note_use(self, connection: Connection, job: DictRow, processor_s: float) -> None:
-        """The attempt runs, and has used so many processor seconds: what counts if its end is never written."""
+        """Record that the attempt runs and what it has used; this counts if its end is never recorded."""
         await connection.execute(
             "UPDATE jobs SET attempt_seen_at = clock_timestamp(),"
             " attempt_processor_s = greatest(attempt_processor_s, %s) WHERE id = %s",
@@ -112,9 +112,9 @@ class Ledger:
     async def checkpoint(
         self, connection: Connection, job: DictRow, prefix: str, files: Sequence[str], step: int
     ) -> None:
-        """Point the job at a new checkpoint and have the one before deleted."""
+        """Point the job at a new checkpoint and discard the previous one."""
         if job["checkpoint"] is not None and job["checkpoint"]["prefix"] == prefix:
-            return  # an earlier try got through, though its acknowledgement was lost
+            return  # an earlier try was committed and only its acknowledgement lost
         await _discard_replaced(connection, job["checkpoint"], prefix)
         await _set(connection, job, "checkpoint", {"prefix": prefix, "files": list(files)})
         await connection.execute("UPDATE jobs SET crashes = 0, losses = 0 WHERE id = %s", (job["id"],))
@@ -124,7 +124,7 @@ class Ledger:
     async def reusable(
         self, connection: Connection, job: DictRow, stage: ReusableStage, prefix: str, files: Sequence[str]
     ) -> None:
-        """Keep the work of a stage for other jobs to start from, in the place of an earlier attempt's."""
+        """Keep a stage's work for other jobs to reuse, in place of an earlier attempt's."""
         await _discard_replaced(connection, job["reusable"].get(stage), prefix)
         stages = {**job["reusable"], stage: {"prefix": prefix, "files": list(files)}}
         await _set(connection, job, "reusable", stages)
@@ -133,7 +133,7 @@ class Ledger:
     async def preview(
         self, connection: Connection, job: DictRow, prefix: str, artifacts: Sequence[Artifact], now: Progress
     ) -> None:
-        """Let the job show these files, in the place of those before."""
+        """Let the job show these files in place of the previous ones."""
         if job["previews"] is not None and job["previews"]["prefix"] == prefix:
             return
         await _discard_replaced(connection, job["previews"], prefix, after_s=PREVIEW_KEPT_S)
@@ -143,14 +143,14 @@ class Ledger:
         await _add_event(connection, job, "preview", data)
 
     async def log(self, lines: Sequence[str]) -> None:
-        """Append lines to the job's log; what is more than `LOG_LINES_MAX` is in its log file alone."""
+        """Append lines to the job's log; lines beyond `LOG_LINES_MAX` are only in its log file."""
         await self._append(lines, [])
 
     @_fenced(_nothing)
     async def _append(
         self, connection: Connection, job: DictRow, lines: Sequence[str], lengths: list[int]
     ) -> None:
-        """``lengths`` of the log before each try: where it grew, an earlier try got through."""
+        """``lengths`` of the log before each try: if it grew, an earlier try was committed."""
         before = int(job["log_lines"])
         lengths.append(before)
         left = LOG_LINES_MAX - before
@@ -170,12 +170,12 @@ class Ledger:
 
     @_fenced(lambda _: 0)
     async def crashes(self, _: Connection, job: DictRow) -> int:
-        """How often attempts crashed since the job's last checkpoint, this one not counted."""
+        """How many attempts crashed since the job's last checkpoint, without this one."""
         return int(job["crashes"])
 
     @_fenced(lambda _: False)
     async def wants_partial(self, _: Connection, job: DictRow) -> bool:
-        """Whether who cancelled the job wants what there is of its result."""
+        """Whether a partial result was requested with the cancellation."""
         return bool(job["keep_partial"])
 
     @_fenced(_not_cancelled)
@@ -187,9 +187,9 @@ class Ledger:
         verdict: VerdictName | None,
         faults: Sequence[str] = (),
     ) -> bool:
-        """Make the result the job's one result, and count faults by code.
+        """Publish the job's result, and count faults by code.
 
-        False where a cancellation was asked for first.
+        Returns False if a cancellation was requested first.
         """
         if job["cancel_requested"]:
             return False
@@ -204,7 +204,7 @@ class Ledger:
     async def fail(
         self, connection: Connection, job: DictRow, error: JobError, artifacts: Sequence[Artifact]
     ) -> bool:
-        """End the job as failed; False if it was cancelled instead."""
+        """End the job as failed; returns False if it was cancelled instead."""
         if job["cancel_requested"]:
             await finish_cancelled(connection, job["id"], self._stall_s, artifacts, self.claim.name)
             return False
@@ -214,12 +214,12 @@ class Ledger:
 
     @_fenced(_nothing)
     async def cancelled(self, connection: Connection, job: DictRow, artifacts: Sequence[Artifact]) -> None:
-        """End the job as cancelled, with what is wanted of the files."""
+        """End the job as cancelled, with the files that are wanted."""
         await finish_cancelled(connection, job["id"], self._stall_s, artifacts, self.claim.name)
 
     @_fenced(_not_cancelled)
     async def give_back(self, connection: Connection, job: DictRow, how: Requeue) -> bool:
-        """Back to the queue; False if the job was cancelled instead."""
+        """Put the job back into the queue; returns False if it was cancelled instead."""
         if job["cancel_requested"]:
             await finish_cancelled(connection, job["id"], self._stall_s)
             return False
@@ -228,7 +228,7 @@ class Ledger:
 
 
 async def _add_event(connection: Connection, job: DictRow, event: EventType, data: Mapping[str, Any]) -> None:
-    """As `add_event`; a job with `EVENTS_MAX` of them shows the change in its record alone."""
+    """As `add_event`; beyond `EVENTS_MAX` events, only the job's record shows the change."""
     if job["seq"] < EVENTS_MAX:
         await add_event(connection, job["id"], event, data)
         return
@@ -251,6 +251,6 @@ async def _set(
 async def _discard_replaced(
     connection: Connection, replaced: Mapping[str, Any] | None, prefix: str, *, after_s: float = 0.0
 ) -> None:
-    """Have the files deleted that a column named before those under ``prefix``."""
+    """Discard the files that a column referred to before those under ``prefix``."""
     if replaced is not None and replaced["prefix"] != prefix:
         await discard(connection, replaced["prefix"], after_s=after_s)

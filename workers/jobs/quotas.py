@@ -1,4 +1,4 @@
-"""Quotas of tenants, checked in the transaction that uses them up, so that no two requests take the last place."""
+"""Quotas of tenants, checked in the transaction that uses them, so that only one request gets the last place."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from workers.settings.errors import Conflict, LimitReached, NotFound
 
 
 async def submitting_for(connection: Connection, dataset_ids: Collection[str], seen_by: str | None) -> str:
-    """The tenant of jobs on the datasets, whose submits take turns from here to the end of the transaction.
+    """The tenant of the datasets; its submissions are serialized until the end of the transaction.
 
-    So no two of them take its last place, or the same idempotency key. Other tenants' do not wait for them: at the
-    limit of the whole queue as many jobs more can get in as submits run at that moment.
+    So no two of them take its last place, or the same idempotency key. Other tenants do not wait, so the limit of the
+    whole queue can be exceeded by as many jobs as are submitted concurrently.
 
-    Raises `NotFound` where the tenant ``seen_by`` does not see one of them.
+    Raises `NotFound` if the tenant ``seen_by`` cannot see one of them.
     """
     # Datasets before the tenant, as uploads lock them.
     sql = "SELECT id, tenant FROM datasets WHERE id = ANY(%s) AND tenant = coalesce(%s, tenant) ORDER BY id FOR SHARE"
@@ -27,7 +27,7 @@ async def submitting_for(connection: Connection, dataset_ids: Collection[str], s
 
 
 async def require_room(connection: Connection, dataset_id: str, priority: int, max_queued: int) -> None:
-    """What must hold for one more job on the dataset.
+    """Check that one more job on the dataset is allowed.
 
     Raises `NotFound`, `Conflict` (``dataset_not_ready``, ``priority_not_allowed``), `LimitReached`
     (``queue_full``: ``max_queued`` jobs wait already; ``quota_exhausted``; ``daily_limit_reached``).
@@ -71,9 +71,9 @@ async def _require_seconds(connection: Connection, tenant: str, limit: int) -> N
 
 
 async def require_byte_quota(connection: Connection, dataset_id: str, size: int) -> None:
-    """Raises `LimitReached` (``quota_exhausted``) where the dataset's tenant may not store so much more.
+    """Raises `LimitReached` (``quota_exhausted``) if the dataset's tenant may not store ``size`` more bytes.
 
-    From here to the end of the transaction nothing else of the tenant is counted.
+    Locks the tenant's quotas until the end of the transaction.
     """
     tenant = await connection.value("SELECT tenant FROM datasets WHERE id = %s", dataset_id)
     if tenant is not None:

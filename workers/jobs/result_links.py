@@ -1,6 +1,6 @@
-"""Links that show the page of one job, read-only and for a while: made, listed, recognised, revoked.
+"""Links that show one job's page, read-only and for a limited time: created, listed, recognised, revoked.
 
-Signed links to single files are not kept: the database has their job's round, which they were signed with.
+Signed links to single files are not stored, only their job's round, with which they were signed.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from workers.records import record_from_row
 from workers.settings.errors import Conflict, LimitReached
 from workers.tenants.tokens import living_row, new_token
 
-MOST = 50  # living links to one job
+MOST = 50  # valid links to one job
 _LIVING = "result_links.expires_at > clock_timestamp()"
 
 
@@ -28,7 +28,7 @@ class ResultLinkStore(OwnedStore):
     async def create(self, job_id: str, valid_s: int) -> tuple[LinkView, str]:
         """A new link and its text, which cannot be read again.
 
-        Raises `NotFound`, `LimitReached`, `Conflict` (``result_not_ready``: a failed job is not for strangers).
+        Raises `NotFound`, `LimitReached`, `Conflict` (``result_not_ready``: a failed job cannot be shared).
         """
         prefix, text, sha256 = new_token("brl")
         async with self._database.transaction() as connection:
@@ -54,7 +54,7 @@ class ResultLinkStore(OwnedStore):
             return _view(row), text
 
     async def list(self, job_id: str) -> tuple[LinkView, ...]:
-        """The living links to a job, oldest first; raises `NotFound`."""
+        """The valid links to a job, oldest first; raises `NotFound`."""
         async with self._database.transaction() as connection:
             sql = f"SELECT id FROM jobs WHERE id = %s AND {MINE}"
             await connection.required_row(f"No job {job_id}.", sql, job_id, self._tenant)
@@ -73,20 +73,20 @@ class ResultLinkStore(OwnedStore):
             await connection.required_row(f"No link {link_id}.", sql, link_id, job_id, self._tenant)
 
     async def share_round(self, job_id: str) -> int:
-        """The round that links to files of the job are signed with now; raises `NotFound`."""
+        """The round with which links to the job's files are currently signed; raises `NotFound`."""
         sql = f"SELECT share_round FROM jobs WHERE id = %s AND {MINE}"
         async with self._database.transaction() as connection:
             row = await connection.required_row(f"No job {job_id}.", sql, job_id, self._tenant)
         return int(row["share_round"])
 
     async def revoke_shares(self, job_id: str) -> None:
-        """End all links to files of the job, by the next round; raises `NotFound`."""
+        """Revoke all links to files of the job by starting the next round; raises `NotFound`."""
         sql = f"UPDATE jobs SET share_round = share_round + 1 WHERE id = %s AND {MINE} RETURNING id"
         async with self._database.transaction() as connection:
             await connection.required_row(f"No job {job_id}.", sql, job_id, self._tenant)
 
     async def recognise(self, text: str) -> tuple[LinkView, str] | None:
-        """The living link with this text, and the owner of its job; None says no more than that there is none."""
+        """The valid link with this text, and the owner of its job; None for any other text."""
         select = (
             f"SELECT result_links.*, jobs.tenant, {_LIVING} AS living FROM result_links"
             " JOIN jobs ON jobs.id = job_id WHERE prefix = %s"

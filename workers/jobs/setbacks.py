@@ -1,4 +1,4 @@
-"""Why an attempt ended though its job is not over, and what that means for the job."""
+"""Why an attempt ended before its job did, and the consequences for the job."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Literal
 from biresnerf.wire.problems import JobError
 
 Cause = Literal["worker_lost", "killed", "error", "disk_full", "store_away"]
-# Workers that a job may lose one after the other, likewise: most are stopped or frozen, some did the job take down.
+# Lost workers allowed, per allowed crash: most were stopped or frozen, some killed by the job.
 LOSSES_PER_CRASH = 3
-# Attempts of a job at most, in crashes that it may have one after the other: each of them may store a checkpoint first.
+# Attempts allowed, per allowed crash: each may store a checkpoint, which resets the count of crashes.
 ATTEMPTS_PER_CRASH = 10
 
 
@@ -20,10 +20,10 @@ class Setback:
     """One way for an attempt to end too early.
 
     Attributes:
-        counts: as what, of which a job may have so many without a new checkpoint between them.
+        counts: as a crash or a lost worker, of which a job may have so many between checkpoints; or not at all.
         what: what happened, after "The last time ".
-        hint: what to do where it happened too often.
-        message: what the job's owner reads while the job waits.
+        hint: what to do if it happens too often.
+        message: shown to the job's owner while the job waits.
     """
 
     counts: Literal["crash", "loss"] | None
@@ -64,9 +64,9 @@ SETBACKS: Mapping[Cause, Setback] = {
 
 
 def used_up(attempts: int, crashes: int, losses: int, max_attempts: int) -> bool:
-    """Whether a job may not be tried again.
+    """Whether a job has used up its attempts.
 
-    After so many attempts, and so many crashes and lost workers since its last checkpoint.
+    Given its attempts, and the crashes and lost workers since its last checkpoint.
     """
     return (
         crashes >= max_attempts
@@ -76,7 +76,7 @@ def used_up(attempts: int, crashes: int, losses: int, max_attempts: int) -> bool
 
 
 def crashed_too_often(attempts: int, cause: Cause | None, log_tail: str = "") -> JobError:
-    """The error of a job that may not be tried again; ``cause`` of the last attempt's end."""
+    """The error of a job that has used up its attempts; ``cause`` ended the last one."""
     last = SETBACKS[cause or "error"]
     times = "once" if attempts == 1 else f"{attempts} times"
     return JobError(

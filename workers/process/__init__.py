@@ -1,1 +1,1 @@
-"""Processes and what bounds them: child processes, watchdog, disk space, turns. Knows nothing of jobs."""
+"""Processes and their limits: child processes, watchdog, disk space, memory, turns. Knows nothing of jobs."""

@@ -1,6 +1,6 @@
 """Runs a program that dies with its parent: `python die_with_parent.py PARENT_PID SIGNAL USER NICE COMMAND…`.
 
-A program of its own (standard library only, started by path) instead of a ``preexec_fn``, because Python code
+A separate program (standard library only, started by path) instead of a ``preexec_fn``, because Python code
 between fork and exec can deadlock in a process that has threads. USER is a user name, or ``-`` for no change. NICE
 is added to its nice value.
 """
@@ -26,7 +26,7 @@ def main(arguments: list[str]) -> None:
         os.setgid(entry.pw_gid)
         os.setuid(entry.pw_uid)
         os.environ["HOME"] = entry.pw_dir
-    # After the change of user: the kernel forgets the wish when credentials change.
+    # After the change of user: the kernel clears the setting when credentials change.
     if (
         sys.platform == "linux"
         and ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal_number) != 0
@@ -42,8 +42,8 @@ def _give_way(nice: int) -> None:
     if nice == 0:
         return
     value = os.nice(nice)
-    # Linux may schedule each session as a group (sched(7), autogroup). Then a nice value counts within the session
-    # only, and the group has one of its own.
+    # Linux may schedule each session as a group (sched(7), autogroup). Then a nice value counts only within the
+    # session, and the group has a separate one.
     if os.getsid(0) == os.getpid():
         with contextlib.suppress(OSError), open("/proc/self/autogroup", "w") as group:
             group.write(str(value))
@@ -52,9 +52,9 @@ def _give_way(nice: int) -> None:
 def dying_with_parent(
     command: list[str], *, signal_number: int, user: str | None = None, nice: int = 0
 ) -> list[str]:
-    """The command line of ``command`` as a process that dies with this one, and gives way to others if ``nice``.
+    """The command line that runs ``command`` so that it dies with this process, with ``nice`` added.
 
-    Start it in a session of its own if it is to give way to processes of other sessions.
+    Start it in its own session if it is to give way to processes of other sessions.
     """
     return [
         *(sys.executable, "-I", "-S", os.path.abspath(__file__)),

@@ -1,4 +1,4 @@
-"""Folders for the work of a living process, deleted with it: nobody else takes one away that is still in use."""
+"""Work folders of living processes, deleted with them. No process deletes one that is in use."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 IN_USE = ".in-use"
-SETTLED_S = 1.0  # a folder that is younger was perhaps made just now, and is not locked yet
+SETTLED_S = 1.0  # a younger folder may not be locked yet
 
 
 @contextlib.asynccontextmanager
@@ -22,7 +22,7 @@ async def locked_folder(parent: Path) -> AsyncIterator[Path]:
     folder = Path(tempfile.mkdtemp(dir=parent))
     try:
         with (folder / IN_USE).open("wb") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)  # the kernel frees it, however we die
+            fcntl.flock(lock, fcntl.LOCK_EX)  # the kernel releases it, however we die
             yield folder
     finally:
         await asyncio.to_thread(shutil.rmtree, folder, ignore_errors=True)
@@ -32,7 +32,7 @@ def sweep_folders(parent: Path) -> int:
     """Removes folders of dead processes, which no longer hold the lock; returns how many."""
     removed = 0
     for folder in parent.iterdir() if parent.is_dir() else ():
-        with contextlib.suppress(OSError):  # gone by now
+        with contextlib.suppress(OSError):  # deleted meanwhile
             if time.time() - folder.stat().st_mtime >= SETTLED_S and not _in_use(folder):
                 shutil.rmtree(folder, ignore_errors=True)
                 removed += 1
@@ -46,5 +46,5 @@ def _in_use(folder: Path) -> bool:
     except BlockingIOError:
         return True
     except FileNotFoundError:
-        pass  # half removed
+        pass  # partly deleted
     return False

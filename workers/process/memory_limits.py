@@ -1,4 +1,4 @@
-"""How much memory programs that read strangers' files may take, so that side by side they stay below the container's.
+"""Memory limits of programs that read strangers' files: together they fit into the container's.
 
 A container that runs out of memory is killed as a whole, with every request that it serves.
 """
@@ -9,14 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 PROC, GROUPS = Path("/proc"), Path("/sys/fs/cgroup")
-# A web process itself, after load.
+# A web process itself, after heavy use.
 WEB_BYTES = 512 * 2**20
 # Without a limit. The check: numpy, Pillow, and decoders with pictures of up to 150 million pixels; a picture for
 # pages: one such decoder; unpacking: zlib, and the table of contents of the archive with most entries.
 CHECK_BYTES, PICTURE_BYTES, UNPACK_BYTES = 6 * 2**30, 6 * 2**30, 1536 * 2**20
 CHECK_VARIABLE = "BIRESNERF_CHECK_MEMORY_BYTES"  # tells the check's program its limit
 PICTURES_AT_ONCE, UNPACKED_AT_ONCE = 2, 4
-# Rather one after the other than each with less; a picture of 150 million pixels takes the first.
+# With less for each, fewer run at once; a picture of 150 million pixels needs the first.
 PICTURE_BYTES_MIN, UNPACK_BYTES_MIN = 2816 * 2**20, 128 * 2**20
 # With less than this for all of them, the programs do not even start.
 SHARED_BYTES_MIN = 2**30
@@ -24,7 +24,7 @@ SHARED_BYTES_MIN = 2**30
 
 @dataclass(frozen=True)
 class MemoryShares:
-    """Bytes for each program of a kind, and how many of that kind run at a time; there is one check."""
+    """Bytes per program of each kind, and how many of a kind run at a time; there is one check."""
 
     check: int
     picture: int
@@ -34,7 +34,7 @@ class MemoryShares:
 
 
 def memory_shares(limit: int | None, processes: int) -> MemoryShares:
-    """What the programs of each of ``processes`` web processes may take in a container limited to ``limit`` bytes.
+    """The memory for the programs of each of ``processes`` web processes, in a container of ``limit`` bytes.
 
     Half is for the check, three eighths are for pictures. Below 1.5 GiB for each web process the limit cannot be kept.
     """
@@ -54,19 +54,19 @@ def memory_shares(limit: int | None, processes: int) -> MemoryShares:
 
 
 def memory_limit(proc: Path = PROC, groups: Path = GROUPS) -> int | None:
-    """The least limit of this process's control groups (version 2 or 1), bytes; none where nothing limits it."""
+    """The lowest limit of this process's control groups (version 2 or 1), bytes; None if there is none."""
     found = []
     for path in group_files("memory.max", "memory.limit_in_bytes", proc, groups):
         try:
             found.append(int(path.read_text()))
         except (OSError, ValueError):  # no such file, or "max"
             continue
-    # Version 1 says "no limit" by a number near the largest.
+    # Version 1 writes "no limit" as a huge number.
     return min((limit for limit in found if limit < 2**60), default=None)
 
 
 def group_files(name: str, name_in_v1: str, proc: Path = PROC, groups: Path = GROUPS) -> list[Path]:
-    """Where this process's memory control groups may have the file, the innermost first.
+    """Possible paths of the file in this process's memory control groups, innermost first.
 
     Inside a container its own group is the root.
     """

@@ -1,4 +1,4 @@
-"""Heavy work that one process does a few at a time, shared fairly between those who ask for it."""
+"""Limits heavy work to a few items at a time per process, shared fairly between tenants."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from contextlib import asynccontextmanager
 
 
 class Turns:
-    """At most ``at_once`` turns at a time. Tenants that wait take them one after the other.
+    """At most ``at_once`` turns at a time. Waiting tenants get them in rotation.
 
     A tenant with a hundred requests delays each other tenant by one, not by a hundred.
     """
 
     def __init__(self, at_once: int) -> None:
         self._free = at_once
-        # Whose turn it is next comes first.
+        # In order: whose turn is next comes first.
         self._waiting: OrderedDict[str, deque[asyncio.Future[None]]] = OrderedDict()
 
     @asynccontextmanager
@@ -38,7 +38,7 @@ class Turns:
             await mine
         except asyncio.CancelledError:
             if mine.done() and not mine.cancelled():
-                self._pass_on()  # given just now, and not wanted any more
+                self._pass_on()  # granted just now, and no longer needed
             raise
 
     def _pass_on(self) -> None:

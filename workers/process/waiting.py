@@ -18,7 +18,7 @@ T = TypeVar("T")
 
 
 async def first_done(*waits: Awaitable[object]) -> None:
-    """Until the first of them is done; coroutines among them are cancelled, tasks are left running."""
+    """Wait for the first to finish; cancels the other coroutines, but leaves tasks running."""
     tasks = [asyncio.ensure_future(wait) for wait in waits]
     try:
         await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -29,7 +29,7 @@ async def first_done(*waits: Awaitable[object]) -> None:
 
 
 async def retry_while_unavailable(work: Callable[[], Awaitable[T]]) -> T:
-    """The answer of ``work``, tried again for as long as it raises `Unavailable`. Warns once a minute."""
+    """The result of ``work``, retried while it raises `Unavailable`. Warns once a minute."""
     warned_at = -WARN_AGAIN_S
     while True:
         try:

@@ -1,4 +1,4 @@
-"""Runs an engine process, and ends one whose event loop hangs: only a process that ended is started again."""
+"""Runs an engine process, and ends it if its event loop hangs: only ended processes are restarted."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from workers.settings.settings import Settings
 
 log = logging.getLogger(__name__)
 
-# Long for anything that a loop of ours does in one step; a file system that hangs takes longer.
+# Far longer than any step of our loops takes; a hanging file system takes longer.
 STUCK_S = 60.0
 LOOKS = 10
 
 
 @contextlib.asynccontextmanager
 async def end_if_hung(stuck_s: float = STUCK_S, beat: Path | None = None) -> AsyncIterator[None]:
-    """While inside, the process ends with `ExitStatus.STUCK` where this event loop does nothing for ``stuck_s``.
+    """Within the context, ends the process with `ExitStatus.STUCK` if this event loop hangs for ``stuck_s``.
 
-    The loop touches the file ``beat`` all the while: deploy/health.py goes by its age, where a library that keeps
-    Python's lock holds up our thread as well.
+    The loop keeps touching the file ``beat``. deploy/health.py checks its age, because a library that holds Python's
+    lock blocks our thread as well.
     """
     watchdog = _Watchdog(stuck_s / LOOKS, beat)
     watchdog.start()
@@ -43,7 +43,7 @@ async def end_if_hung(stuck_s: float = STUCK_S, beat: Path | None = None) -> Asy
 
 @contextlib.asynccontextmanager
 async def end_if_broken(broken: asyncio.Event) -> AsyncIterator[None]:
-    """While inside, the process ends with `ExitStatus.STUCK` once ``broken`` is set, which nothing else mends."""
+    """Within the context, ends the process with `ExitStatus.STUCK` once ``broken`` is set: only a restart helps."""
 
     async def end() -> None:
         await broken.wait()
@@ -58,7 +58,7 @@ async def end_if_broken(broken: asyncio.Event) -> AsyncIterator[None]:
 
 
 def run_process(name: str, work: Callable[[Settings], Awaitable[ExitStatus]]) -> ExitStatus:
-    """Run ``work``, which tells the exit status, with the settings of the environment."""
+    """Run ``work``, which returns the exit status, with the settings of the environment."""
     settings = Settings()
     set_up_logging(name, settings)
 
@@ -81,7 +81,7 @@ class _Watchdog(threading.Thread):
         self._period_s, self._ticks = period_s, 0
 
     async def tick(self) -> None:
-        """Show that the loop goes on."""
+        """Show that the loop is running."""
         while True:
             self._ticks += 1
             self._show()
@@ -89,13 +89,13 @@ class _Watchdog(threading.Thread):
 
     def _show(self) -> None:
         if self._beat is not None:
-            with contextlib.suppress(OSError):  # a full disk is no reason to end
+            with contextlib.suppress(OSError):  # a full disk must not end the process
                 self._beat.parent.mkdir(parents=True, exist_ok=True)
                 self._beat.touch()
 
     def run(self) -> None:
         """Check until `end` is set."""
-        # Looks are counted, not seconds: of a process that was frozen as a whole, this thread was frozen too.
+        # Counts looks, not seconds: when the whole process is frozen, so is this thread.
         seen, in_vain = -1, 0
         while not self.end.wait(self._period_s):
             in_vain = in_vain + 1 if self._ticks == seen else 0

@@ -1,4 +1,4 @@
-"""The worker's heartbeat: a thread with a connection of its own."""
+"""The worker's heartbeat: a thread with its own connection."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ log = logging.getLogger(__name__)
 
 
 class Heartbeat(threading.Thread):
-    """Tells the queue every ``period_s`` that the worker is alive, without end.
+    """Tells the queue every ``period_s`` that the worker is alive, until `end`.
 
-    A thread of its own, because deleting a large folder can hold up the event loop for longer than the stall time.
-    A connection on which no answer comes for ``answer_s`` is given up.
+    A separate thread, because deleting a large folder can block the event loop for longer than the stall time. Drops a
+    connection that does not answer within ``answer_s``.
     """
 
     def __init__(self, url: str, period_s: float, worker_id: int, *, answer_s: float) -> None:
@@ -29,12 +29,12 @@ class Heartbeat(threading.Thread):
         self._end = asyncio.Event()
 
     def run(self) -> None:
-        """Until `end`."""
+        """Send heartbeats until `end`."""
         self._loop.run_until_complete(self._beat())
         self._loop.close()
 
     def end(self) -> None:
-        """Stop; the last heartbeat stays."""
+        """Stop; the last heartbeat stays recorded."""
         with contextlib.suppress(RuntimeError):  # it has ended already
             self._loop.call_soon_threadsafe(self._end.set)
 
@@ -54,7 +54,7 @@ class Heartbeat(threading.Thread):
             await connection.close()
 
     async def _send(self, connection: psycopg.AsyncConnection) -> None:
-        """Raises `TimeoutError`, and at once: a query that is cancelled waits five more seconds for its server."""
+        """Send one; on a timeout raises `TimeoutError` at once: cancelling a query would wait five more seconds."""
         sending = asyncio.ensure_future(connection.execute(HEARTBEAT, (self._worker_id,)))
         await asyncio.wait({sending}, timeout=self._answer_s)
         if not sending.done():

@@ -1,7 +1,7 @@
-"""Puts jobs of dead workers back into the queue, ends those beyond their time, and takes the trash out.
+"""Requeues jobs of dead workers, ends overdue ones, and empties the trash.
 
-Everything about one job happens in one transaction, job row locked first, so two janitors and a cancelling
-client cannot undo each other's work.
+All changes of one job happen in one transaction that locks its row first, so two janitors and a cancelling client
+cannot undo each other's work.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ class Janitor:
         self._upkeep_at = time.monotonic()
 
     async def run(self) -> None:
-        """Rounds until cancelled."""
-        # The trash apart: it can take long, and a round is told by its pause whether the machine slept.
+        """Repeat rounds until cancelled."""
+        # The trash is separate: it can take long, and a pause between rounds means that the machine slept.
         trash = partial(empty_trash, self._database, self._files)
         await asyncio.gather(self._repeat(self._round), self._repeat(trash))
 
@@ -55,7 +55,7 @@ class Janitor:
                 log.warning("janitor: %s", error)
                 if error.code == "database_unavailable":
                     self._healthy_since, self._saw_outage = None, True
-            except Exception:  # it must not end: nothing would replace it in this process
+            except Exception:  # it must go on: nothing would restart it
                 log.exception("janitor: this round failed")
 
     async def _round(self) -> None:
@@ -84,7 +84,7 @@ class Janitor:
             await self._database.run(partial(drop_left_checkpoints, stall_s=self._settings.stall_s))
 
     def _note_pause(self, now_s: float) -> None:
-        """After a machine slept or a database froze all workers were silent, though all live.
+        """Note when the machine slept or the database froze: then all workers were silent though alive.
 
         Measured by the database's clock: our monotonic clock stands still while a machine sleeps.
         """
@@ -95,7 +95,7 @@ class Janitor:
             self._healthy_since, self._saw_outage = None, True
 
     def _silent_workers_are_dead(self, database_age_s: float) -> bool:
-        """After an outage of the database living workers first need time for a heartbeat."""
+        """Whether silence means death: after a database outage, living workers first need time for a heartbeat."""
         patience_s = 1.5 * self._settings.stall_s
         seen_s = time.monotonic() - (self._healthy_since or time.monotonic())
         return seen_s >= patience_s or (not self._saw_outage and database_age_s >= patience_s)
@@ -107,7 +107,7 @@ class Janitor:
 
 
 async def release_worker(database: Database, worker_id: int | None, stall_s: float) -> None:
-    """Release all of a worker known to be dead, at once; none means every worker of this database."""
+    """Release everything of a worker known to be dead, at once; None means all workers of this database."""
     async with database.transaction() as connection:
         for entry_id in await job_queue.entries_of_worker(connection, worker_id):
             await take_back(connection, entry_id, stall_s)

@@ -40,7 +40,7 @@ class Workplace:
     Attributes:
         worker_id: the slot, as the queue knows it.
         scratch: a local folder for the files of running jobs.
-        variables: of the environment of jobs.
+        variables: environment variables of jobs.
         stop: once it is set, running jobs write a checkpoint and go back to the queue.
     """
 
@@ -62,12 +62,12 @@ class Lane:
         self._settings, self._database = place.settings, place.database
 
     async def run(self, over: asyncio.Event, idle_exit_s: float = math.inf) -> None:
-        """Run jobs until ``over`` (and then to the end of the current one), a stop, or nothing to do for so long."""
+        """Run jobs until ``over`` (after the current one), a stop, or ``idle_exit_s`` without any."""
         while (entry := await self.next(over, idle_exit_s)) is not None:
             await self.work_on(entry)
 
     async def next(self, over: asyncio.Event, idle_exit_s: float = math.inf) -> Entry | None:
-        """The next entry of the queue, once there is one; none where this lane is to end."""
+        """Wait for the next queue entry; None if this lane is to end."""
         take = partial(job_queue.take, worker_id=self._place.worker_id, kinds=self._kinds)
         idle_from = time.monotonic()
         with self._place.listener.waiting(job_queue.NEW_ENTRY) as added:
@@ -77,7 +77,7 @@ class Lane:
                     entry = await self._database.run(take)
                 except Unavailable as error:
                     log.warning("the queue cannot be read: %s", error)
-                    entry, idle_from = None, time.monotonic()  # nobody knows whether there is work
+                    entry, idle_from = None, time.monotonic()  # it is unknown whether there is work
                 if entry is not None:
                     return entry
                 left_s = idle_from + idle_exit_s - time.monotonic()
@@ -88,7 +88,7 @@ class Lane:
         return None
 
     async def work_on(self, entry: Entry) -> Ending | None:
-        """How the attempt ended; none where there was nothing to run."""
+        """Run the entry's job; returns how the attempt ended, None if there was nothing to run."""
         with log_context(job_id=entry.job_id):
             try:
                 ending = await self._run_job(entry)

@@ -38,7 +38,7 @@ from workers.store.store_identity import require_same_store
 
 log = logging.getLogger(__name__)
 
-STORE_PATIENCE_S = 180.0  # a job that has run for an hour waits for its store to come back
+STORE_PATIENCE_S = 180.0  # after an hour of work, a job waits for its store to recover
 T = TypeVar("T")
 
 ENDS = {
@@ -54,10 +54,10 @@ HOST = platform.node() or "localhost"
 
 
 class SlotLock:
-    """Makes a slot name unique on this host and remembers the queue id of who held it last."""
+    """Makes a slot name unique on this host and remembers the queue id of its last holder."""
 
     def __init__(self, data_dir: Path, name: str) -> None:
-        """Take the lock; raises `SetupError` (``bad_slot_name``; ``slot_taken`` where another process holds it)."""
+        """Take the lock; raises `SetupError` (``bad_slot_name``; ``slot_taken`` if another process holds it)."""
         if not re.fullmatch(r"[A-Za-z0-9_-]{1,40}", name):
             raise SetupError("bad_slot_name", f"--slot {name!r}: letters, digits, - and _ only, at most 40.")
         self.name = name
@@ -66,7 +66,7 @@ class SlotLock:
         path = folder / f"{HOST}.{name}"
         self._file: IO[str] = path.open("a+")
         try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # freed by the kernel, however we die
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # released by the kernel, however we die
         except BlockingIOError:
             self._file.close()
             raise SetupError(
@@ -77,14 +77,14 @@ class SlotLock:
         self.predecessor = int(text) if text.isdigit() else None
 
     def remember(self, worker_id: int) -> None:
-        """Write down our id for our successor."""
+        """Store our id for our successor."""
         self._file.truncate(0)
         self._file.write(str(worker_id))
         self._file.flush()
 
 
 def lock_free_slot(data_dir: Path, kind: Literal["cpu", "gpu"]) -> SlotLock:
-    """The first free one of ``cpu0``, ``cpu1`` …: workers that come and go leave no more names than run at once."""
+    """Lock the first free one of ``cpu0``, ``cpu1`` …, so that short-lived workers reuse names."""
     for number in count():
         try:
             return SlotLock(data_dir, f"{kind}{number}")
@@ -97,8 +97,8 @@ def lock_free_slot(data_dir: Path, kind: Literal["cpu", "gpu"]) -> SlotLock:
 class Slot:
     """Takes jobs from the queue until it is stopped: refinements one after the other, and exports beside them.
 
-    With ``one_job`` it ends after the first, and with ``idle_exit_s`` where it found none for so long. ``gpu`` is the
-    device of its jobs; with none they get what the environment gives them.
+    Ends after the first with ``one_job``, and after ``idle_exit_s`` without any. ``gpu`` is the device of its jobs; if
+    None, the environment decides.
     """
 
     def __init__(
@@ -117,8 +117,8 @@ class Slot:
         self._stop = asyncio.Event()
 
     async def run(self) -> ExitStatus:
-        """Until SIGTERM or SIGINT. A running job then writes a checkpoint and goes back to the queue."""
-        # Left by a predecessor, which the lock shows to be gone.
+        """Run until SIGTERM or SIGINT. A running job then writes a checkpoint and goes back to the queue."""
+        # Left by a predecessor, which is dead, since we hold the lock.
         shutil.rmtree(self._scratch, ignore_errors=True)
         self._scratch.mkdir(parents=True)
         async with open_database(
@@ -155,7 +155,7 @@ class Slot:
         worker_id = await retry_while_unavailable(lambda: database.run(job_queue.register_worker))
         self._lock.remember(worker_id)
         await retry_while_unavailable(lambda: announce_slot(database, HOST, self._name, worker_id))
-        # Time for a second try, on another connection, before a janitor takes the job back.
+        # Leaves time for a retry, on a new connection, before a janitor takes the job back.
         in_time_s = self._settings.stall_s / 3
         heartbeat = Heartbeat(database.url, self._settings.beat_s, worker_id, answer_s=in_time_s)
         heartbeat.start()
@@ -185,7 +185,7 @@ class Slot:
         return ExitStatus.NO_JOB
 
     async def _exporting(self, place: Workplace, work: Coroutine[None, None, T]) -> T:
-        """What ``work`` returns. Exports run beside it: they take seconds, and it may take hours."""
+        """The result of ``work``, with exports run beside it: they take seconds, it may take hours."""
         over = asyncio.Event()
         working = asyncio.create_task(work)
         exporting = asyncio.create_task(Lane(place, (EXPORTS,)).run(over))
@@ -199,7 +199,7 @@ class Slot:
             exporting.cancel()
 
     def _variables(self) -> Mapping[str, str]:
-        """Which device and how many cores the job of this slot may use."""
+        """Environment variables for the device and the cores that this slot's jobs may use."""
         variables = {"PYTHONUNBUFFERED": "1"}
         if self._gpu is not None:
             variables["CUDA_VISIBLE_DEVICES"] = self._gpu
@@ -226,7 +226,7 @@ def run_slot(
         )
         set_up_traces(lock.name, settings)
         gpu = re.fullmatch(r"gpu(\d+)", lock.name)
-        # What gave the process a device of its own knows which; the free slot's number says nothing of it.
+        # A batch system has chosen the process's device; the free slot's number is not the GPU's.
         given_device = free_slot is not None and "CUDA_VISIBLE_DEVICES" in os.environ
         device = gpu[1] if gpu and not given_device else None
         return await Slot(settings, lock, gpu=device, one_job=one_job, idle_exit_s=idle_exit_s).run()

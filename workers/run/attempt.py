@@ -1,4 +1,4 @@
-"""One attempt at one job: stage the files, run the process, carry its reports, conclude."""
+"""One attempt at one job: stage the files, run the process, deliver its reports, record the end."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ log = logging.getLogger(__name__)
 StopReason = Literal["cancel", "shutdown"]
 EXIT_ERRORS = {2: "InputError", 3: "RefinementError"}  # deterministic: another attempt would end the same
 EXIT_MEMORY = 4
-# Of a process that the kernel may have killed for want of memory; the second where it was a process of its own.
+# Ends of a process that the kernel may have killed for lack of memory: its own, and the error of a killed child.
 KILLED, CHILD_KILLED = -signal.SIGKILL, "seeding_crashed"
 # Ours to fix, not the user's: a checkpoint of an older version, for example. The job starts over.
 STALE_CHECKPOINT = {"output_not_resumable", "checkpoint_invalid"}
@@ -54,7 +54,7 @@ DISCARDED_GRACE_S = 2.0  # for a cancelled job of which no partial result is wan
 class Ending:
     """How an attempt ended: with its job, stopped from outside, or too early.
 
-    ``again_in_s``: in how many seconds the queue offers the job again; none where it is over.
+    ``again_in_s``: seconds until the queue offers the job again; None if it has ended.
     """
 
     how: Literal["succeeded", "failed", "cancelled", "stopped", "setback"]
@@ -94,7 +94,7 @@ class Attempt:
     async def run(self) -> Ending:
         """Run to the end. Raises `Fenced`.
 
-        What goes wrong on our side counts as a crash of the attempt, unless disk or store are to blame.
+        Our own failures count as a crash of the attempt, unless disk or store are to blame.
         """
         noting = asyncio.create_task(self._note_use_again())
         try:
@@ -108,7 +108,7 @@ class Attempt:
             shutil.rmtree(self._folder, ignore_errors=True)
 
     async def _note_use_again(self) -> None:
-        with contextlib.suppress(Fenced):  # the next write of the attempt itself ends it
+        with contextlib.suppress(Fenced):  # the attempt's next write ends it
             while True:
                 await asyncio.sleep(self._settings.beat_s)
                 await self._note_use()
@@ -140,7 +140,7 @@ class Attempt:
         return Ending("failed" if await self._ledger.fail(error, artifacts) else "cancelled")
 
     async def _wait(self, cause: Cause) -> Ending:
-        """Back to the queue until there is room, or the store answers."""
+        """Give the job back until there is room, or the store answers."""
         log.warning("job %s goes back to the queue: %s", self._claim.job_id, cause)
         return await self._give_back(Requeue("requeued", {"why": cause}, cause), self._settings.stall_s / 4)
 
@@ -149,8 +149,8 @@ class Attempt:
         return f"jobs/{self._claim.job_id}/results/{self._claim.name}"
 
     async def _run_process(self) -> int | None:
-        """Exit status of the process; none where a stop came before it was started."""
-        # From the start again where database or store go away, which is no fault of the job.
+        """The exit status of the process; None if a stop came before its start."""
+        # Restarted if database or store go away, which is no fault of the job.
         staging = asyncio.create_task(
             retry_while_unavailable(lambda: stage_job(self._database, self._files, self._claim, self._folder))
         )
@@ -160,7 +160,7 @@ class Attempt:
             return None
         await staging
         self._oom_kills_before = self._oom_kills.count()
-        # What a job that is killed leaves behind goes with its folder.
+        # Temporary files of a killed job are deleted with its folder.
         variables = {**self._variables, "TMPDIR": str(self._folder / "tmp")}
         child = self._child = await Child.start(
             self._settings.job_command, self._folder, self._log, variables, nice=self._settings.job_nice
@@ -255,13 +255,13 @@ class Attempt:
         return not used_up(self._claim.attempt, crashes, 0, self._settings.max_attempts)
 
     def _log_crash(self) -> None:
-        """What the process says for the operator alone."""
+        """Log the process's report of a crash, for the operator alone."""
         with contextlib.suppress(OSError):
             text = (self._folder / CRASH_NAME).read_text(errors="replace")
             log.error("the process of job %s failed:\n%s", self._claim.job_id, text)
 
     def _killed_for_memory(self, status: int) -> bool:
-        """Whether the kernel killed a process meanwhile, and this one's end looks like it."""
+        """Whether this process ended like a killed one and the kernel has killed one meanwhile."""
         if self._stop_reason is not None or self._timed_out:
             return False
         if status != KILLED and self._reported_error().code != CHILD_KILLED:
@@ -270,11 +270,11 @@ class Attempt:
         return now is not None and now > (self._oom_kills_before or 0)
 
     async def _ran_out_of_memory(self) -> Ending:
-        """Once more with less, from the start: a checkpoint is of the sizes that were too large."""
+        """Retry with smaller options, from the start: checkpoints have the sizes that were too large."""
         tail = log_tail(self._log)
         smaller: dict[str, Any] = {}
         if self._claim.kind == "refine":
-            # Until the process reports its options, assume a CPU, which takes less than a GPU.
+            # Until the process reports its options, assume a CPU, whose defaults are smaller than a GPU's.
             smaller = smaller_options(self._resolved or parse_options(self._claim.options).resolved("cpu"))
         if smaller and not self._claim.smaller and await self._may_try_again():
             data = {"why": "out_of_memory", "options": smaller, "log_tail": tail}
@@ -285,7 +285,7 @@ class Attempt:
         return await self._fail(error, await self._store(log_only=True))
 
     def _reported_result(self) -> tuple[VerdictName | None, tuple[str, ...]]:
-        """The report's verdict, None where it passes none, and the codes of its faults."""
+        """The report's verdict, if any, and the codes of its faults."""
         if self._claim.kind != "refine":
             return None, ()
         try:
@@ -310,14 +310,14 @@ class Attempt:
     async def _store(
         self, *, log_only: bool = False, enough: Callable[[], bool] = lambda: False
     ) -> list[Artifact]:
-        """The output and the log, under this attempt's own prefix."""
+        """Store the output and the log under this attempt's prefix."""
         return await store_result(
             self._files, self._result_prefix, self._output, self._log, log_only=log_only, enough=enough
         )
 
 
 def smaller_options(options: ResolvedOptions) -> dict[str, Any]:
-    """Options of a second try that change to take less memory; empty if none can."""
+    """The options to change so that a second try needs less memory; empty if there are none."""
     now = options.model_dump()
     less = {name: o.smaller(now[name]) for name, o in OPTIONS.items() if o.smaller is not None}
     return {name: value for name, value in less.items() if value != now[name]}
@@ -337,9 +337,9 @@ def out_of_memory(smaller: Mapping[str, Any], log_tail: str) -> JobError:
 
 
 class OomKills:
-    """Counts the processes that the kernel has killed for want of memory, in this container or on this machine.
+    """Counts the processes that the kernel has killed for lack of memory.
 
-    The container's own count where there is one (control groups of version 2 or 1), else the machine's.
+    In this container if that is counted (control groups of version 2 or 1), else on this machine.
     """
 
     def __init__(self, proc: Path = PROC, groups: Path = GROUPS) -> None:
@@ -347,7 +347,7 @@ class OomKills:
         self._files = [*counts, proc / "vmstat"]
 
     def count(self) -> int | None:
-        """How many so far; none where the kernel does not say."""
+        """The count so far; None if the kernel does not tell."""
         for path in self._files:
             try:
                 found = re.search(r"^oom_kill (\d+)$", path.read_text(), re.MULTILINE)

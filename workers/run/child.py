@@ -1,4 +1,4 @@
-"""The process of one job: started in its own session, tied to us, stopped politely and then for good."""
+"""A job's process: started in its own session, tied to us; stopped by a signal, killed if that does not help."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Child:
     ) -> Child:
         """Run ``command FOLDER`` inside ``folder`` with a clean environment; appends stderr to ``log``.
 
-        ``nice``: how much it gives way to other processes, the API's above all.
+        ``nice``: lowers its priority, mainly against the API's processes.
         """
         # The job reads strangers' files: it gets neither the database's address nor other settings of ours.
         inherited = {name: value for name, value in os.environ.items() if not name.startswith("BIRESNERF_")}
@@ -56,7 +56,7 @@ class Child:
         return child
 
     def _reap(self, loop: asyncio.AbstractEventLoop) -> None:
-        """In a thread: asyncio and `subprocess` do not say what a process used."""
+        """Wait in a thread: asyncio and `subprocess` do not report a process's resource use."""
         _, status, used = os.wait4(self.pid, 0)
         self._process.returncode = os.waitstatus_to_exitcode(status)
         self._processor_s = used.ru_utime + used.ru_stime
@@ -80,13 +80,13 @@ class Child:
             yield line
 
     async def wait(self) -> int:
-        """Exit status (negative: killed by that signal), after taking its descendants down too."""
+        """The exit status (negative: killed by that signal); kills its descendants as well."""
         status = await asyncio.shield(self._ended)
         self.kill()
         return status
 
     async def stop(self, grace_s: float) -> None:
-        """Ask it to write a checkpoint and exit; kill it when it takes longer than ``grace_s``."""
+        """Ask it to write a checkpoint and exit; kill it after ``grace_s``."""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.pid, signal.SIGTERM)
         await asyncio.wait({self._ended}, timeout=grace_s)
@@ -101,15 +101,15 @@ class Child:
     def processor_s(self) -> float:
         """User and system seconds of the process and its descendants until now.
 
-        While it runs, of all processes of its session, from /proc (proc_pid_stat(5)); after its end what the kernel
-        counted (wait4(2)), without descendants that it did not wait for.
+        While it runs, summed over its session from /proc (proc_pid_stat(5)); after its end, the kernel's count
+        (wait4(2)), without descendants that it did not wait for.
         """
         if self._processor_s is not None:
             return self._processor_s
         ticks = 0
         for stat in Path("/proc").glob("[0-9]*/stat"):
             with contextlib.suppress(OSError):
-                # From the third on: the name before them may hold anything.
+                # Fields from the third on; the name before them may hold anything.
                 values = stat.read_bytes().rpartition(b")")[2].split()
                 if int(values[3]) == self.pid:
                     ticks += sum(map(int, values[11:15]))

@@ -1,4 +1,4 @@
-"""Delivers the reports of a job's process to the database and the file store, without blocking the process."""
+"""Delivers a job process's reports to the database and the file store, without blocking the process."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from workers.store.files import FileStore
 log = logging.getLogger(__name__)
 
 PERIOD_S = 1.0
-LINE_CHARACTERS_MAX = 2000  # of a line of the log
+LINE_CHARACTERS_MAX = 2000  # per line of the log
 LINES_AT_ONCE = 500
 _READ_BYTES = 2**18
 
@@ -63,7 +63,7 @@ class Courier:
             self._reusable[stage].put(progress)
 
     def close(self, *, last_checkpoint: bool = True) -> None:
-        """No more reports will come. Of a cancelled job the ``last_checkpoint`` is not needed."""
+        """Call it after the last report. A cancelled job does not need its ``last_checkpoint``."""
         if not last_checkpoint:
             self._checkpoints.latest = None
         self._closed.set()
@@ -72,7 +72,7 @@ class Courier:
             box.due.set()
 
     async def run(self) -> None:
-        """Deliver until closed and all is delivered."""
+        """Deliver until closed and everything is delivered."""
         deliveries = [
             asyncio.create_task(self._carry_progress()),
             asyncio.create_task(self._carry_log()),
@@ -116,7 +116,7 @@ class Courier:
             await self._pause()
 
     async def _pause(self) -> None:
-        """Wakes early for the end only: everything else can wait for the period."""
+        """Wait for the period; wakes early only when closed."""
         try:
             await asyncio.wait_for(self._closed.wait(), PERIOD_S)
         except TimeoutError:
@@ -132,20 +132,20 @@ class Courier:
                 try:
                     await store(progress)
                 except (OSError, ValueError, StoreError, EngineError) as error:
-                    # The job can go on without: another one will come, or the one before will do.
+                    # The job can continue: a later file will follow, or the previous one suffices.
                     log.error("a file of %s was not stored: %s", self._ledger.claim.job_id, error)
             if closed:
                 return
 
     async def _store_checkpoint(self, progress: Progress) -> None:
-        """A new object each time, then the pointer: a checkpoint is never overwritten."""
+        """Store a new object, then move the pointer: a checkpoint is never overwritten."""
         prefix = self._new_prefix("checkpoints")
         for name, path in files_inside(self._output, [str(progress.checkpoint)]).items():
             await self._files.put_path(f"{prefix}/{name}", path)
             await self._point(prefix, self._ledger.checkpoint(prefix, [name], progress.step))
 
     async def _store_preview(self, progress: Progress) -> None:
-        """The same for the files that show how far the job is."""
+        """The same for previews."""
         prefix = self._new_prefix("previews")
         found = files_inside(self._output, progress.preview)
         try:
@@ -153,7 +153,7 @@ class Courier:
                 await store_artifact(self._files, prefix, name, path) for name, path in sorted(found.items())
             ]
         except FileNotFoundError:
-            return  # the job has ended meanwhile, and has cleaned up
+            return  # the job has ended and cleaned up meanwhile
         if artifacts:
             await self._point(prefix, self._ledger.preview(prefix, artifacts, progress))
 
@@ -171,7 +171,7 @@ class Courier:
         try:
             await writing
         except Fenced:
-            await self._files.delete_prefix(prefix)  # neither the new owner nor the trash refers to it
+            await self._files.delete_prefix(prefix)  # neither the new owner nor the trash knows it
             raise
 
     def _new_prefix(self, kind: str) -> str:
@@ -181,7 +181,7 @@ class Courier:
 
 
 class _Box:
-    """The latest report that has something to be stored; one that was not fetched in time is dropped."""
+    """Holds the latest report with something to store; a newer one replaces it."""
 
     def __init__(self) -> None:
         self.latest: Progress | None = None
@@ -193,17 +193,17 @@ class _Box:
 
 
 class _LogLines:
-    """Gives each line of a file once, as soon as it is whole."""
+    """Returns each line of a file once, as soon as it is complete."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._offset, self._rest = path, 0, b""
         self._lines: list[str] = []
 
     def fresh(self, *, last: bool) -> list[str]:
-        """The next lines, `LINES_AT_ONCE` at most; none if there are no more. ``last``: the file is whole."""
+        """The next lines, `LINES_AT_ONCE` at most; empty if there are no more. ``last``: the file is complete."""
         while len(self._lines) < LINES_AT_ONCE and (read := self._read()):
             *whole, self._rest = (self._rest + read).split(b"\n")
-            if len(self._rest) > _READ_BYTES:  # no line at all; its beginning will do
+            if len(self._rest) > _READ_BYTES:  # too long for a line: split it
                 whole, self._rest = [*whole, self._rest], b""
             self._lines += map(_shown, whole)
         if last and self._rest and len(self._lines) < LINES_AT_ONCE:

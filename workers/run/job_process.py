@@ -93,7 +93,7 @@ def _unexpected(error: Exception) -> int:
 
 
 class _Stop:
-    """What SIGTERM means: stop soon and keep what there is, or end at once where there is nothing to keep."""
+    """Handles SIGTERM: stop soon and keep what there is, or end at once if there is nothing to keep."""
 
     def __init__(self) -> None:
         self.asked = threading.Event()
@@ -101,14 +101,12 @@ class _Stop:
 
     def ask(self) -> None:
         if self.stage == "preparing":
-            os._exit(
-                EXIT_STOPPED
-            )  # loading torch, compiling kernels and reading images take long to come to an end
+            os._exit(EXIT_STOPPED)  # importing torch or reading images cannot be interrupted quickly
         self.asked.set()
 
 
 def is_out_of_memory(error: Exception) -> bool:
-    """Whether less of everything might have gone well."""
+    """Whether the error is a lack of memory, which smaller options may avoid."""
     if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
         return True
     # torch's own, of the GPU (a class) and of the CPU (a text); not imported here, as most jobs never fail.
@@ -149,7 +147,7 @@ def _refine(order: Order, options: RefineOptions, protocol: TextIO, stop: _Stop)
 
 
 def _give_video_frames(order: Order) -> None:
-    """The result names frames of a video that was sent: nobody else has them."""
+    """Add the frames of a video that the result names: nobody else has them."""
     from biresnerf.data.photos.video.video_frames import CHOSEN, VIDEO_FRAMES
 
     frames = order.input / VIDEO_FRAMES
@@ -158,7 +156,7 @@ def _give_video_frames(order: Order) -> None:
 
 
 def _export(order: Order, stop: _Stop) -> None:
-    """Write the result in further formats; the photos are in the input where a format needs them."""
+    """Write the result in more formats; the input has the photos if a format needs them."""
     from biresnerf.data.formats.codec import WriteContext
     from biresnerf.data.formats.result_formats import export_result, read_result
 
@@ -175,7 +173,7 @@ def _export(order: Order, stop: _Stop) -> None:
 
 
 def _protocol_only() -> TextIO:
-    """The real standard output, for reports alone: what libraries print goes to standard error."""
+    """Reserve standard output for reports: what libraries print goes to standard error."""
     protocol = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     return protocol
@@ -185,5 +183,5 @@ if __name__ == "__main__":
     status = main(Path(sys.argv[1]))
     logging.shutdown()
     sys.stderr.flush()
-    # All is on disk and reported. Unloading torch takes a while, for which a cancelling user would wait.
+    # Everything is on disk and reported. A cancelling user need not wait for torch to unload.
     os._exit(status)

@@ -1,4 +1,4 @@
-"""From the files that a job's process wrote to artifacts in the store, each attempt under a prefix of its own."""
+"""Stores the files of a job's process as artifacts, each attempt's under its own prefix."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from workers.store.files import FileStore
 log = logging.getLogger(__name__)
 
 KEPT_FROM_CLIENTS = {"checkpoint", PREVIEW_FOLDER}
-# Stored first: what a job that is cancelled meanwhile should not lose.
+# Stored first, so that a job that is cancelled meanwhile keeps them.
 FIRST = (LOG_NAME, "report.json", POSES_NAME, "transforms.json")
 
 
@@ -28,9 +28,9 @@ async def store_result(
     log_only: bool = False,
     enough: Callable[[], bool] = lambda: False,
 ) -> list[Artifact]:
-    """Store the output, all but checkpoint and previews, and the log; stops early once ``enough``.
+    """Store the output, except checkpoint and previews, and the log; stops early once ``enough``.
 
-    Waits for a store that is away: the work is done by now.
+    Waits while the store is away, as the work is already done.
     """
     names = {LOG_NAME: log_file} if log_file.exists() else {}
     for path in () if log_only else sorted(output.rglob("*")):
@@ -61,7 +61,7 @@ async def store_artifact(files: FileStore, prefix: str, name: str, path: Path) -
 
 
 def files_inside(output: Path, names: Iterable[str]) -> dict[str, Path]:
-    """The files that a process named, as far as they are plain files below its output folder."""
+    """Those of the named files that are plain files below the output folder."""
     found = {}
     for name in names:
         pure = PurePosixPath(name)

@@ -1,4 +1,4 @@
-"""Fills the folder of a job's process: the order, its input, and the checkpoint to resume from."""
+"""Fills the folder of a job's process: order, input, and the checkpoint to resume from."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ PANORAMA_VIEWS = "panorama_views/"  # of a result: what was cut from its dataset
 
 
 async def stage_job(database: Database, files: FileStore, claim: Claim, folder: Path) -> None:
-    """Fill the fresh job folder. Paths in the order are relative, so that an attempt elsewhere is the same job.
+    """Fill the fresh job folder. Paths in the order are relative, so that another machine can continue the job.
 
-    Raises `NotFound` where a file is gone, `Unavailable`.
+    Raises `NotFound` if a file is gone, `Unavailable`.
     """
     shutil.rmtree(folder, ignore_errors=True)
     for name in ("input", "output", "tmp"):
@@ -54,12 +54,12 @@ def _needs_photos(names: list[str]) -> bool:
 
 
 def _resumed_files(claim: Claim) -> Iterator[tuple[str, str]]:
-    """The last checkpoint; before there is one, the work of stages that is to be taken over."""
+    """The files of the last checkpoint, or before the first, the stages' work to reuse."""
     if claim.checkpoint is not None:
         parts = [claim.checkpoint]
     else:
-        # Of its own stages a job repeats the first alone: another device could not take over the others. And
-        # with less memory, the sizes differ.
+        # Of its own work a job reuses only the first stage: other devices cannot reuse the others, and with less memory
+        # sizes differ.
         wanted = ["seeding"]
         if claim.forked_stage == "coarse" and not claim.smaller:
             wanted.append("coarse")
