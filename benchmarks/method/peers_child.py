@@ -13,7 +13,13 @@ import time
 from pathlib import Path
 from typing import Any
 
-from biresnerf.data.seeding.colmap_child import DATABASE, describe, extract_features
+from biresnerf.data.seeding.colmap_child import (
+    DATABASE,
+    camera_numbers,
+    describe,
+    extract_features,
+    import_images,
+)
 from biresnerf.data.seeding.colmap_pairs import matched_pairs, write_position_priors
 
 
@@ -21,15 +27,16 @@ def match(request: dict[str, Any]) -> dict[str, Any]:
     """SIFT of all photos, matches of all pairs; how long either took, and the database's numbers of the cameras."""
     import pycolmap
 
-    database = Path(request["work"], DATABASE)
+    database, photos = Path(request["work"], DATABASE), Path(request["root"])
     began = time.monotonic()
-    numbers = extract_features(request, database, Path(request["root"]), pycolmap.FeatureExtractionOptions())
+    import_images(request, database, photos)
+    extract_features(request, database, photos, pycolmap.FeatureExtractionOptions())
     extracted = time.monotonic()
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = request["seed"]
     pycolmap.match_exhaustive(database, verification_options=verification)
     return {
-        "numbers": numbers,
+        "numbers": camera_numbers(request, database),
         "pairs": len(matched_pairs(database)),
         "features_s": extracted - began,
         "matching_s": time.monotonic() - extracted,

@@ -103,6 +103,9 @@ class SeedingPreview:
             message += f": features of {len(found.features)} of {len(self._dataset)} photos found"
         poses = refined_set(self._dataset, self._dataset.world_from_cam) if given else None
         self._show(found, poses, message)
+        if found.kept is not None:
+            kept = found.kept.relative_to(self._folder.path).as_posix()
+            self._monitor.report(Progress(stage="seeding", message=message, checkpoint=kept))
 
     def _forecast(self, found: SeedingProgress) -> None:
         forecast, count = self._monitor.forecast, len(self._dataset)

@@ -121,6 +121,8 @@ class _Sink:
         self._entries += 1
         if self._entries > self.entries_max:
             raise self._too_many()
+        if not name:
+            raise self.rejected("The archive is damaged: an entry has no name.")
         path = checked_path(name)
         return None if is_litter(path) else path
 

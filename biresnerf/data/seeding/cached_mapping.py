@@ -15,6 +15,7 @@ from biresnerf.data.seeding.seeding_progress import OnSeeding, SeedingProgress
 from biresnerf.options.refine_options import SeedingEffort
 
 GUIDED_LIMIT_S, LIMIT_S = 900.0, 3600.0  # where all poses are given, and else
+MANY = 150  # photos; more have longer
 
 
 def remembered_mapping(
@@ -42,6 +43,8 @@ def remembered_mapping(
         on_progress(SeedingProgress())
         if limit_s is None:
             limit_s = GUIDED_LIMIT_S if dataset.posed.all() else LIMIT_S
+            limit_s *= max(1.0, len(dataset) / MANY)
+        kept = None if remember is None else remember.with_name(f"features-{keys[0][:16]}.db")
         answer = ask_colmap(
             dataset,
             should_stop=should_stop,
@@ -49,10 +52,12 @@ def remembered_mapping(
             effort=effort,
             limit_s=limit_s,
             log_folder=remember.parent if remember is not None else None,
+            kept=kept,
             on_progress=on_progress,
         )
-        if remember is not None:
+        if remember is not None and kept is not None:
             write_text(remember, json.dumps({"key": keys[0], "answer": answer}))
+            kept.unlink(missing_ok=True)
     return read_mapping(dataset, answer)
 
 

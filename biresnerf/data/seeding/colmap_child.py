@@ -7,13 +7,19 @@ process: its crashes end this one only, and time limits and cancelling work by e
 from __future__ import annotations
 
 import json
+import shutil
+import sqlite3
 import sys
+import time
 
 # pycolmap's wheels export another zlib; Python's own must be bound first, or PNG and gzip corrupt the heap.
 import zlib  # noqa: F401
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+from biresnerf.data.model.atomic_file import whole_file
 from biresnerf.data.seeding.colmap_pairs import (
     drop_contradicting_pairs,
     leave_out_still,
@@ -33,6 +39,7 @@ ENOUGH_PLACED = 0.8  # of the images: where all poses are given, no other way of
 # 1.1, fox 13.6 in place of 20.5, and both are as exact (0.191 and 0.053 deg).
 RARELY = 1.4
 INTRINSICS_FROM = 0.5  # of the images: a model of fewer does not say what the lens is
+PHOTOS_AT_ONCE = 100  # between two copies of the database
 
 
 def main(request_path: Path) -> None:
@@ -59,10 +66,17 @@ def map_images(request: dict[str, Any]) -> dict[str, Any]:
     database, images = work / DATABASE, Path(request["root"])
     count = sum(len(camera["names"]) for camera in request["cameras"])
     pycolmap.set_random_seed(request["seed"])
-    numbers = extract_features(request, database, images, extraction_options(request))
+    kept = Path(request["kept"]) if request["kept"] else None
+    copies = DatabaseCopies(database, kept, request["copy_every_s"])
+    if copies.restore():
+        say("features and matches that were found before are taken up again")
+    else:
+        import_images(request, database, images)
+    extract_features(request, database, images, extraction_options(request), copies.now_and_then)
+    numbers = camera_numbers(request, database)
     tie_rigs(database, request["rigs"])
     say(f"features of {count} images found")
-    match_features(request, database, work)
+    match_features(request, database, work, copies.now_and_then)
     if still := leave_out_still(request, database):
         say("two motions in many pairs: matches that stay where they are are left out")
     (work / MATCHED).touch()
@@ -96,6 +110,40 @@ def map_images(request: dict[str, Any]) -> dict[str, Any]:
     return {"models": answer, "matches": matches, "still": still}
 
 
+class DatabaseCopies:
+    """Copies of the database, made now and then while it grows: a run that is killed goes on from the last one.
+
+    The database itself lies in a temporary folder, as databases do badly on network drives; a copy is one whole file.
+    Copies are made between calls of pycolmap, when it holds no lock: it brings an SQLite of its own. Nothing is copied
+    where ``kept`` is None.
+    """
+
+    def __init__(self, database: Path, kept: Path | None, every_s: float) -> None:
+        self._database, self._kept, self._every_s = database, kept, every_s
+        self._next = time.monotonic() + every_s
+
+    def restore(self) -> bool:
+        """Begin with the copy of an earlier run, if there is one."""
+        if self._kept is None or not self._kept.is_file():
+            return False
+        shutil.copyfile(self._kept, self._database)
+        return True
+
+    def now_and_then(self) -> None:
+        """Copy what has been added, if it is time."""
+        begun = time.monotonic()
+        if self._kept is None or begun < self._next:
+            return
+        with (
+            whole_file(self._kept) as temporary,
+            closing(sqlite3.connect(self._database)) as growing,
+            closing(sqlite3.connect(temporary)) as copy,
+        ):
+            growing.backup(copy)
+        done = time.monotonic()
+        self._next = done + self._every_s * max(1.0, done - begun)  # large ones are made rarely
+
+
 def extraction_options(request: dict[str, Any]) -> Any:
     """How thoroughly to look for features: pycolmap's options."""
     import pycolmap
@@ -109,32 +157,61 @@ def extraction_options(request: dict[str, Any]) -> Any:
     return extraction
 
 
-def extract_features(request: dict[str, Any], database: Path, images: Path, extraction: Any) -> list[int]:
-    """Features of all images; returns the database's number of each camera asked for."""
+def import_images(request: dict[str, Any], database: Path, images: Path) -> None:
+    """Number the cameras and their photos in their order; else those come first that a thread is done with first."""
     import pycolmap
 
     pycolmap.Database.open(database).close()
     for camera in request["cameras"]:
-        if not camera["names"]:
-            continue
-        reader = pycolmap.ImageReaderOptions()
-        reader.camera_model = camera["model"]
-        if request["masks"] is not None:
-            reader.mask_path = request["masks"]
-        if camera["params"] is not None:
-            reader.camera_params = ",".join(repr(float(value)) for value in camera["params"])
-        # Numbers photos in their order; else those come first that a thread is done with first.
-        pycolmap.import_images(
-            database,
-            images,
-            camera_mode=pycolmap.CameraMode.SINGLE,
-            image_names=camera["names"],
-            options=reader,
-        )
-        pycolmap.extract_features(
-            database, images, image_names=camera["names"], camera_mode=pycolmap.CameraMode.SINGLE,
-            reader_options=reader, extraction_options=extraction,
-        )  # fmt: skip
+        if camera["names"]:
+            pycolmap.import_images(
+                database,
+                images,
+                camera_mode=pycolmap.CameraMode.SINGLE,
+                image_names=camera["names"],
+                options=_reader(request, camera),
+            )
+
+
+def extract_features(
+    request: dict[str, Any],
+    database: Path,
+    images: Path,
+    extraction: Any,
+    after_some: Callable[[], None] = lambda: None,
+) -> None:
+    """Features of all photos that have none yet; ``after_some`` is called now and then."""
+    import pycolmap
+
+    for camera in request["cameras"]:
+        for first in range(0, len(camera["names"]), PHOTOS_AT_ONCE):
+            pycolmap.extract_features(
+                database,
+                images,
+                image_names=camera["names"][first : first + PHOTOS_AT_ONCE],
+                camera_mode=pycolmap.CameraMode.SINGLE,
+                reader_options=_reader(request, camera),
+                extraction_options=extraction,
+            )
+            after_some()
+
+
+def _reader(request: dict[str, Any], camera: dict[str, Any]) -> Any:
+    import pycolmap
+
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = camera["model"]
+    if request["masks"] is not None:
+        reader.mask_path = request["masks"]
+    if camera["params"] is not None:
+        reader.camera_params = ",".join(repr(float(value)) for value in camera["params"])
+    return reader
+
+
+def camera_numbers(request: dict[str, Any], database: Path) -> list[int]:
+    """The database's number of each camera in the request; -1 of one without photos."""
+    import pycolmap
+
     with pycolmap.Database.open(database) as opened:
         camera_of = {image.name: image.camera_id for image in opened.read_all_images()}
     firsts = [camera["names"][0] if camera["names"] else "" for camera in request["cameras"]]

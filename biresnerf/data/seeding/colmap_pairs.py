@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from biresnerf.data.seeding.seeding_progress import PAIRS
 # Features of a photo that tell which pairs are likely, and COLMAP's ratio.
 COARSEST, NEAREST_TO_NEXT = 256, 0.8
 LEAST_MATCHES = 12  # of a pair; small photos have few, COLMAP asks for more
+PAIRS_AT_ONCE = 2000  # between two copies of the database
 PAIR_OUTLIER = 3.0  # median disagreements beyond which a pair's matches are taken for repeated structure
 PAIR_OUTLIER_DEG = 30.0  # but not below this
 # Matches nearer than this, px at the size at which COLMAP's bounds hold, stay where they are (COLMAP's default). Of a
@@ -22,10 +24,13 @@ PAIR_OUTLIER_DEG = 30.0  # but not below this
 STILL_PX, INNER, FEWEST_STILL, STILL_PAIRS = 4.0, 1 / 3, 8, 0.1
 
 
-def match_features(request: dict[str, Any], database: Path, work: Path) -> None:
+def match_features(
+    request: dict[str, Any], database: Path, work: Path, after_some: Callable[[], None] = lambda: None
+) -> None:
     """Matches of all pairs, or of those listed, and the relative poses they support.
 
-    Or of the likeliest of these, where the request says how many of each photo.
+    Or of the likeliest of these, where the request says how many of each photo. Pairs that are matched already stay as
+    they are; ``after_some`` is called now and then.
     """
     import pycolmap
 
@@ -36,15 +41,18 @@ def match_features(request: dict[str, Any], database: Path, work: Path) -> None:
     if request["likeliest"] is not None:
         pairs = likeliest_pairs(database, pairs, request["likeliest"])
     if pairs is None:
-        pycolmap.match_exhaustive(database, matching_options=matching, verification_options=verification)
-        return
-    listed = work / PAIRS
+        names = [name for camera in request["cameras"] for name in camera["names"]]
+        pairs = list(combinations(sorted(names), 2))
+    listed, some = work / PAIRS, work / "some_pairs.txt"
     listed.write_text("".join(f"{a} {b}\n" for a, b in pairs), "utf-8")
-    pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = str(listed)
-    pycolmap.match_image_pairs(
-        database, matching_options=matching, pairing_options=pairing, verification_options=verification
-    )
+    for first in range(0, len(pairs), PAIRS_AT_ONCE):
+        some.write_text("".join(f"{a} {b}\n" for a, b in pairs[first : first + PAIRS_AT_ONCE]), "utf-8")
+        pairing = pycolmap.ImportedPairingOptions()
+        pairing.match_list_path = str(some)
+        pycolmap.match_image_pairs(
+            database, matching_options=matching, pairing_options=pairing, verification_options=verification
+        )
+        after_some()
 
 
 def verification_options(request: dict[str, Any]) -> Any:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.data.model.atomic_file import whole_file
 from biresnerf.data.points.tracks import KEPT, Tracks
 
 # Handed on: checkpoints carry them, 16 bytes each. Of an image, where that is more.
@@ -40,7 +41,8 @@ def write_tracks(database_path: Path, work: Path) -> Tracks | None:
         return None
     tracks = tracks.thinned(most_observations(len(number)), len(number))
     arrays: dict[str, Any] = tracks.kept()
-    np.savez(work / KEPT, **arrays)
+    with whole_file(work / KEPT) as temporary:  # whoever stops this process takes what is there
+        np.savez(temporary, **arrays)
     return tracks
 
 

@@ -61,6 +61,7 @@ WIDEST_LOW, MOST_FEATURES_LOW = 800, 1024
 # from 400 px on they rarely gain anything. In px, of the long side and of all photos.
 THOROUGH_BELOW, THOROUGH_UP_TO = 400, 10e6
 
+COPY_EVERY_S = 60.0  # of features and matches, for a run that is killed
 _QUICKLY = 1  # PNG's compression of photos that are written for COLMAP, and removed after
 
 
@@ -117,13 +118,15 @@ def ask_colmap(
     effort: SeedingEffort,
     limit_s: float,
     log_folder: Path | None = None,
+    kept: Path | None = None,
     on_progress: OnSeeding = lambda _found: None,
 ) -> dict[str, Any]:
     """What COLMAP finds, as plain data for `read_mapping`. Poses that the set has guide it.
 
-    Beside the log in ``log_folder`` the tracks are left, for `Tracks.load`. One thread maps where all poses are
-    given: more would make the answer differ from run to run. Where little is asked, one also looks for features and
-    matches: each takes memory.
+    Beside the log in ``log_folder`` the tracks are left, for `Tracks.load`, also where mapping took too long. The file
+    ``kept`` holds what is found of features and matches, for a run that goes on after it was killed. One thread maps
+    where all poses are given: more would make the answer differ from run to run. Where little is asked, one also looks
+    for features and matches: each takes memory.
 
     Raises:
         InputError: ``seed_timeout``, or a code of `open_image`.
@@ -135,6 +138,8 @@ def ask_colmap(
         request = {
             **lay_out(dataset, Path(work)),
             "answer": str(Path(work, "answer.json")),
+            "kept": None if kept is None else str(kept),
+            "copy_every_s": COPY_EVERY_S,
             "seed": seed,
             "threads": 1 if low else -1,
             "mapping_threads": 1 if low or dataset.posed.all() else -1,
@@ -143,11 +148,12 @@ def ask_colmap(
         request |= thoroughness(dataset, effort, pairs)
         if request["likeliest"] is not None:
             pairs = min(pairs, chosen_pairs(len(dataset), request["likeliest"]))
-        watch = SeedingWatch(Path(work, DATABASE), pairs, on_progress)
-        answer = run_colmap(request, Path(work), should_stop, limit_s, log_folder, watch.look)
-        if log_folder is not None:
-            keep_tracks(Path(work), dataset.names, log_folder / KEPT)
-        return answer
+        watch = SeedingWatch(Path(work, DATABASE), pairs, on_progress, kept)
+        try:
+            return run_colmap(request, Path(work), should_stop, limit_s, log_folder, watch.look)
+        finally:
+            if log_folder is not None:
+                keep_tracks(Path(work), dataset.names, log_folder / KEPT)
 
 
 def lay_out(dataset: Dataset, work: Path) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import sqlite3
 import time
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 LOOK_EVERY_S = 2.0
@@ -25,6 +25,7 @@ class SeedingProgress:
         matches: how many features each pair has in common once that was verified; pairs with any alone.
         tried: how many pairs were verified, of `pairs` in all.
         matched: whether matching is over.
+        kept: a new copy of all this, for a run that goes on later.
     """
 
     features: dict[int, int] = field(default_factory=dict)
@@ -32,6 +33,7 @@ class SeedingProgress:
     tried: int = 0
     pairs: int = 0
     matched: bool = False
+    kept: Path | None = None
 
 
 OnSeeding = Callable[[SeedingProgress], None]
@@ -66,18 +68,30 @@ def read_progress(database: Path, pairs: int) -> SeedingProgress | None:
 
 
 class SeedingWatch:
-    """Tells of news in the database, when asked to look, and never more often than every few seconds."""
+    """Tells of news in the database, when asked to look, and never more often than every few seconds.
 
-    def __init__(self, database: Path, pairs: int, tell: OnSeeding) -> None:
-        self._database, self._pairs, self._tell = database, pairs, tell
+    Args:
+        kept: where copies of the database go.
+    """
+
+    def __init__(self, database: Path, pairs: int, tell: OnSeeding, kept: Path | None = None) -> None:
+        self._database, self._pairs, self._tell, self._kept = database, pairs, tell, kept
         self._told, self._next = SeedingProgress(), time.monotonic() + LOOK_EVERY_S
+        self._copied_at = self._time_of_copy()
 
     def look(self) -> None:
         """Tell if it is time and there is news."""
         if time.monotonic() < self._next:
             return
         found = read_progress(self._database, self._pairs)
-        if found is not None and found != self._told:
+        copied_at = self._time_of_copy()
+        if found is not None and (found != self._told or copied_at != self._copied_at):
             self._told = found
-            self._tell(found)
+            self._tell(replace(found, kept=self._kept if copied_at != self._copied_at else None))
+            self._copied_at = copied_at
         self._next = time.monotonic() + LOOK_EVERY_S
+
+    def _time_of_copy(self) -> int:
+        if self._kept is None or not self._kept.is_file():
+            return 0
+        return self._kept.stat().st_mtime_ns

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from biresnerf.data.formats.read_dataset import read_dataset
-from biresnerf.data.seeding.colmap_child import extract_features
+from biresnerf.data.seeding.colmap_child import extract_features, import_images
 from biresnerf.data.seeding.colmap_pairs import likeliest_pairs
 from biresnerf.data.seeding.map_images import COMPARISONS, MOST_FEATURES, thoroughness
 from tests.data.scenes import nerfstudio_scene, save
@@ -47,7 +47,9 @@ def test_photos_are_numbered_in_their_order_however_long_each_takes(tmp_path):
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = 2
     database = Path(tmp_path, "database.db")
-    extract_features({"cameras": [camera], "masks": None}, database, tmp_path, options)
+    asked = {"cameras": [camera], "masks": None}
+    import_images(asked, database, tmp_path)
+    extract_features(asked, database, tmp_path, options)
     opened = pycolmap.Database.open(database)
     assert [image.name for image in sorted(opened.read_all_images(), key=lambda i: i.image_id)] == names
     opened.close()
@@ -66,7 +68,9 @@ def strip(tmp_path):
     camera = {"names": names, "model": "SIMPLE_PINHOLE", "params": None}
     database = tmp_path / "database.db"
     options = pycolmap.FeatureExtractionOptions()
-    extract_features({"cameras": [camera], "masks": None}, database, tmp_path, options)
+    asked = {"cameras": [camera], "masks": None}
+    import_images(asked, database, tmp_path)
+    extract_features(asked, database, tmp_path, options)
     return database, dict(zip(names, places, strict=True))
 
 

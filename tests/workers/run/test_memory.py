@@ -62,6 +62,7 @@ def test_a_second_try_reaches_colmap(photos: Path, asked: list[dict[str, Any]], 
         "root",
         "work",
         "answer",
+        "kept",
     }
     assert {k: v for k, v in before.items() if k not in same} == {
         k: v for k, v in after.items() if k not in same
