@@ -1,1 +1,1 @@
-"""What the operator sets, and what every process has: logs, traces, errors."""
+"""The operator's settings, and what all processes share: logs, traces, errors."""

@@ -50,12 +50,12 @@ def may_connect(address: Address, allowed: Sequence[Network] = ()) -> bool:
 
 
 def unwrapped(address: Address) -> Address:
-    """The IPv4 address inside a mapped or NAT64 one; any other address as it is."""
+    """The IPv4 address inside a mapped or NAT64 one; any other address unchanged."""
     if isinstance(address, ipaddress.IPv6Address) and any(address in wrapper for wrapper in _WRAPPERS):
         return ipaddress.IPv4Address(int(address) & 0xFFFF_FFFF)
     return address
 
 
 def parsed(text: str) -> Address:
-    """The address as the system resolver wrote it; raises `ValueError`."""
+    """Parses an address in the system resolver's notation; raises `ValueError`."""
     return ipaddress.ip_address(text.partition("%")[0])

@@ -1,4 +1,4 @@
-"""The errors of the job engine, by what a caller does about them."""
+"""The errors of the job engine, one class for each way to handle them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class NotFound(EngineError):
 
 
 class Expired(EngineError):
-    """Its retention time is over and its files were deleted."""
+    """The retention time has passed and the files were deleted."""
 
     def __init__(self, detail: str) -> None:
         super().__init__("expired", detail)

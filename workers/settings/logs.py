@@ -38,15 +38,15 @@ _SECRETS = (
     ),
 )
 _HIDDEN_LENGTH_MIN = 6
-# Libraries that log addresses with secrets in them, or log our own outcomes a second time.
+# Libraries that log addresses with secrets, or repeat what we log ourselves.
 _QUIET = {"httpx": logging.WARNING, "httpcore": logging.WARNING, "psycopg.pool": logging.WARNING}
-# While the database is away its pool says so at each attempt.
+# While the database is away, its pool logs every attempt.
 _REPEATING, _REPEAT_S = "psycopg.pool", 60.0
 
 
 @contextlib.contextmanager
 def log_context(**what: str | None) -> Iterator[None]:
-    """Every record logged in the block, in this task and those it starts, carries ``what``, less empty values."""
+    """Adds ``what``, except empty values, to all records logged in the block by this task and those it starts."""
     token = _CONTEXT.set({**_CONTEXT.get(), **{name: text for name, text in what.items() if text}})
     try:
         yield
@@ -55,7 +55,7 @@ def log_context(**what: str | None) -> Iterator[None]:
 
 
 def set_up_logging(process: str, settings: Settings) -> None:
-    """Sends all records of this process to standard error in the form the settings ask for."""
+    """Sends all records of this process to standard error in the configured format."""
     hidden = _secret_values(settings)
     form = JsonLines(process, hidden) if settings.log_format == "json" else PlainLines(process, hidden)
     handler = logging.StreamHandler(sys.stderr)
@@ -107,7 +107,7 @@ def _secret_values(settings: Settings) -> tuple[str, ...]:
 
 
 class _Lines(logging.Formatter):
-    """What both forms share: time, secrets, and the text of an exception."""
+    """The base of both formats: time, masking of secrets, and the text of an exception."""
 
     def __init__(self, process: str, hidden: tuple[str, ...]) -> None:
         super().__init__()

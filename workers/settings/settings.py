@@ -1,4 +1,4 @@
-"""What the operator sets, by environment variables ``BIRESNERF_*`` (lists as JSON), each also by a file: ``…_FILE``."""
+"""The operator's settings: environment variables ``BIRESNERF_*`` (lists as JSON), or files, named by ``…_FILE``."""
 
 from __future__ import annotations
 
@@ -198,7 +198,7 @@ class Settings(BaseSettings):
         dotenv_settings: PydanticBaseSettingsSource,
         file_secret_settings: PydanticBaseSettingsSource,
     ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """What the code gives, the environment, and files that the environment names."""
+        """The sources, by priority: code, the environment, and files that the environment names."""
         return init_settings, env_settings, FileSettingsSource(settings_cls)
 
     @model_validator(mode="after")
@@ -214,7 +214,7 @@ class Settings(BaseSettings):
 
     @property
     def files_dir(self) -> Path:
-        """Root of the file store where `storage_url` is none."""
+        """Root of the file store if `storage_url` is None."""
         return self.data_dir / "files"
 
     @property
@@ -223,7 +223,7 @@ class Settings(BaseSettings):
         return self.data_dir / "postgres"
 
     def require_database_url(self) -> str:
-        """The database's address; raises `SetupError` where none is set."""
+        """The database's address; raises `SetupError` if none is set."""
         if self.database_url is None:
             raise SetupError(
                 "no_database",

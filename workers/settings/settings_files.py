@@ -1,7 +1,7 @@
 """Settings from files: ``BIRESNERF_X_FILE`` names a file that holds the value of ``BIRESNERF_X``.
 
 Containers receive secrets this way: tools that list containers show the environment, and every child process
-inherits it; neither holds for a file.
+inherits it; files avoid both.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""OpenTelemetry traces, if the operator wants them: a request, what it submits, each attempt and its stages.
+"""Optional OpenTelemetry traces: a request, the jobs that it submits, their attempts and stages.
 
-Without ``BIRESNERF_TRACES=otlp`` nothing of OpenTelemetry's SDK is set up, and its API does nothing. Where the spans go
-is said by OpenTelemetry's own variables (``OTEL_EXPORTER_OTLP_ENDPOINT`` …).
+Without ``BIRESNERF_TRACES=otlp``, OpenTelemetry's SDK is not set up and its API does nothing. OpenTelemetry's own
+variables (``OTEL_EXPORTER_OTLP_ENDPOINT`` …) decide where the spans go.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _provider: TracerProvider | None = None
 
 
 def set_up_traces(process: str, settings: Settings) -> None:
-    """From now on this process records spans, if the settings ask for it; raises `SetupError`."""
+    """Make this process record spans, if so configured; raises `SetupError`."""
     global _provider
     if settings.traces == "off":
         return
@@ -47,7 +47,7 @@ def set_up_traces(process: str, settings: Settings) -> None:
 
 
 def flush_traces() -> None:
-    """Sends what is recorded, or gives up within seconds; for ends by a signal, where nothing else would."""
+    """Sends recorded spans, or gives up within seconds; call it before a signal ends the process."""
     if _provider is not None:
         _provider.force_flush(_FLUSH_MS)
 
@@ -62,7 +62,7 @@ def span(name: str, *, parent: str | None, about: Mapping[str, str | int]) -> It
 
 
 def traceparent() -> str | None:
-    """The current span as W3C has it, to go on from in another process; none without traces."""
+    """The current span as a W3C traceparent, for another process to continue; None without traces."""
     carrier: dict[str, str] = {}
     TraceContextTextMapPropagator().inject(carrier)
     return carrier.get("traceparent")
@@ -76,12 +76,12 @@ class StageSpans:
         self._above = context.get_current()
 
     def enter(self, stage: str) -> None:
-        """The stage before, if any, ends; this one begins."""
+        """End the previous stage, if any, and begin this one."""
         self.end()
         self._open = TRACER.start_span(f"stage {stage}", context=self._above)
 
     def end(self) -> None:
-        """No stage is running any more."""
+        """End the current stage."""
         if self._open is not None:
             self._open.end()
             self._open = None

@@ -1,4 +1,4 @@
-"""The two kinds of places files can lie: a folder of this machine, or a bucket of an S3-compatible store."""
+"""The two kinds of file storage: a folder of this machine, or a bucket of an S3-compatible store."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from workers.settings.errors import SetupError
 
 Method = Literal["GET", "PUT"]
 DELETE_BATCH = 1000
-# A slow reader must not hold a request to the store open: a bucket is read in requests of so many bytes.
+# Buckets are read in requests of so many bytes, so that a slow reader keeps none of them open.
 WINDOW_BYTES = 4 * 2**20
 WHOLE = 2**62
 
 
 class Place(Protocol):
-    """What differs between kinds of stores; `workers.store.files.FileStore` does all the rest."""
+    """What differs between the kinds of storage; `workers.store.files.FileStore` does the rest."""
 
     store: ObjectStore
     window_bytes: int
@@ -33,14 +33,14 @@ class Place(Protocol):
         """Delete all below the folder, except the sub-folder named ``keep``."""
 
     async def signed_urls(self, method: Method, keys: Sequence[str], valid_s: int) -> Sequence[str] | None:
-        """Addresses at which a stranger may read or write these keys; none where the place has no such thing."""
+        """URLs with which anybody may read or write these keys; None if the place has no such URLs."""
 
     def attributes(self, media_type: str | None) -> dict[str, str] | None:
-        """What is stored beside the bytes, for who reads the file from the place itself."""
+        """Attributes to store with a file, for clients that read it directly from the place."""
 
 
 class LocalPlace:
-    """A folder, created where it is missing; raises `SetupError` where it cannot be used."""
+    """A folder, created if it is missing; raises `SetupError` if it cannot be used."""
 
     window_bytes = WHOLE
 
@@ -56,7 +56,7 @@ class LocalPlace:
             ) from error
 
     async def delete_folder(self, folder: str, keep: str | None) -> None:
-        """By folders, not by listing: this also takes what an upload that was killed left half-written."""
+        """Remove folders instead of listed files, which also deletes partial files of killed uploads."""
         await asyncio.to_thread(self._remove, self.root / folder, keep)
 
     @staticmethod
@@ -82,7 +82,7 @@ class LocalPlace:
 
 @dataclass(frozen=True)
 class Bucket:
-    """A bucket and how to get in. Without keys the environment's own are used (``AWS_…``, instance roles)."""
+    """A bucket and its credentials. Without keys, those of the environment are used (``AWS_…``, instance roles)."""
 
     name: str
     prefix: str = ""
@@ -105,10 +105,10 @@ class Bucket:
 
 
 class BucketPlace:
-    """A bucket of an S3-compatible store; nothing is asked of it before the first use.
+    """A bucket of an S3-compatible store; not contacted before the first use.
 
     Args:
-        patience_s: how long a request is tried again while the store does not answer.
+        patience_s: how long a request is retried while the store does not answer.
     """
 
     window_bytes = WINDOW_BYTES
@@ -140,7 +140,7 @@ class BucketPlace:
             raise SetupError("storage_unusable", f"Cannot use the bucket {bucket.name}: {error}") from error
 
     async def delete_folder(self, folder: str, keep: str | None) -> None:
-        """By listing. Parts of uploads that were killed are the bucket's to expire (its lifecycle rule)."""
+        """Delete listed files. Parts of killed uploads expire by the bucket's lifecycle rule."""
         kept = None if keep is None else f"{folder}/{keep}/"
         async for batch in obstore.list(self.store, prefix=folder, chunk_size=DELETE_BATCH):
             keys = [meta["path"] for meta in batch]
@@ -149,11 +149,11 @@ class BucketPlace:
                 await obstore.delete_async(self.store, doomed)
 
     async def signed_urls(self, method: Method, keys: Sequence[str], valid_s: int) -> Sequence[str] | None:
-        """Signed here, with the secret key; the store is not asked."""
+        """Signed locally with the secret key, without a request."""
         return await obstore.sign_async(self._signer, method, keys, timedelta(seconds=valid_s))
 
     def attributes(self, media_type: str | None) -> dict[str, str] | None:
-        """As an attachment always: what users sent must not run as a page of the store's origin."""
+        """Always an attachment: users' files must not run as pages of the store's origin."""
         return {
             "Content-Type": media_type or "application/octet-stream",
             "Content-Disposition": "attachment",

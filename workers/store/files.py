@@ -1,6 +1,6 @@
-"""Files by key, over obstore, so that callers see keys, sizes, digests and byte streams.
+"""The file store, based on obstore: callers see keys, sizes, digests and byte streams.
 
-Where they lie (`workers.store.file_places`) makes no difference to callers. Layout:
+The kind of storage (`workers.store.file_places`) makes no difference to callers. Layout:
 ``datasets/{id}/files/{path}``, ``jobs/{id}/checkpoints/{attempt}-{token}-{n}/…``,
 ``jobs/{id}/results/{attempt}-{token}/…``, ``jobs/{id}/logs/{attempt}-{token}.txt``.
 """
@@ -36,13 +36,13 @@ PART_BYTES = 8 * 2**20
 # Up to this size a file goes to the store in one request, from memory.
 SINGLE_BYTES = 4 * 2**20
 HEALTH_S = 5.0
-# How the operating system's "no space left on device" and "file name too long" read once they came through the store.
+# How "no space left on device" and "file name too long" appear in the store's errors.
 _FULL = "(os error 28)"
 _TOO_LONG = "(os error 36)"
 
 
 class StoredFile(Record):
-    """A file in the store; ``sha256`` is known only to who wrote it."""
+    """A file in the store; ``sha256`` is known only to its writer."""
 
     key: str
     size: int
@@ -55,7 +55,7 @@ class FileStore:
     """Files by key. Writes are atomic: a reader sees the old file, the new one or none, never a part.
 
     Keys are relative paths with ``/``; a key with an empty, ``.`` or ``..`` part is refused (`ValueError`).
-    Every method raises `Unavailable` (``storage_unavailable``) where the store does not answer, and `InputError`
+    Every method raises `Unavailable` (``storage_unavailable``) if the store does not answer, and `InputError`
     (``unsafe_path``) for a key that is too long for it.
     """
 
@@ -74,7 +74,7 @@ class FileStore:
         """Store a byte stream of at most ``limit_bytes``, hashing it on the way.
 
         Raises `LimitReached` (``body_too_large`` at the first byte too many, ``storage_full``), `InputError`
-        (``digest_mismatch``) at the end; then nothing is stored, and what was there before stays.
+        (``digest_mismatch``) at the end; then nothing is stored, and an older file stays.
         """
         _checked(key)
         incoming = MeasuredStream(key, chunks, limit_bytes, expected_sha256)
@@ -94,7 +94,7 @@ class FileStore:
                     max_concurrency=2,
                 )
         except (EngineError, FileNotFoundError) as error:
-            if incoming.failure is not None:  # the store may have failed in turn, at giving up the parts
+            if incoming.failure is not None:  # aborting the parts may have failed in turn
                 raise incoming.failure from None
             if isinstance(error, FileNotFoundError):
                 raise Unavailable("storage_unavailable", f"Cannot store {key}: no such bucket.") from error
@@ -118,7 +118,7 @@ class FileStore:
         limit_bytes: int = 2**62,
         expected_sha256: str | None = None,
     ) -> StoredFile:
-        """Store a local file, as `put` does. It is opened once, so a writer that renames over it does not disturb."""
+        """Store a local file, as `put` does. It is opened once, so a writer may replace it by renaming."""
         with path.open("rb") as file:
 
             async def chunks() -> AsyncIterator[bytes]:
@@ -134,7 +134,7 @@ class FileStore:
             )
 
     async def copy(self, source: str, target: str) -> StoredFile:
-        """A copy that the store makes by itself; raises `NotFound` where there is no ``source``."""
+        """Copy within the store; raises `NotFound` if there is no ``source``."""
         _checked(source)
         try:
             with _told(f"Cannot copy {source}"):
@@ -153,9 +153,9 @@ class FileStore:
         return _stored(key, meta)
 
     async def read(self, key: str, start: int = 0, end: int | None = None) -> AsyncIterator[bytes]:
-        """The bytes ``[start, end)`` of a file, in chunks; ``end`` none is the file's end.
+        """The bytes ``[start, end)`` of a file, in chunks; ``end`` None means the file's end.
 
-        Raises `NotFound` when the first chunk is asked for; call `head` before answering a client.
+        Raises `NotFound` only at the first chunk, so call `head` before responding to a client.
         """
         info = await self.head(key)
         stop = info.size if end is None else min(end, info.size)
@@ -179,18 +179,18 @@ class FileStore:
         return sorted(found, key=lambda file: file.key)
 
     async def delete(self, key: str) -> None:
-        """Delete a file; one that is not there is no error."""
+        """Delete a file; a missing one is no error."""
         with contextlib.suppress(FileNotFoundError), _told(f"Cannot delete {key}"):
             await obstore.delete_async(self._store, _checked(key))
 
     async def delete_prefix(self, prefix: str, *, keep: str | None = None) -> None:
-        """Delete all under the folder ``prefix``, except the sub-folder named ``keep``."""
+        """Delete everything under the folder ``prefix``, except the sub-folder named ``keep``."""
         folder = _checked(prefix.rstrip("/"))
         with contextlib.suppress(FileNotFoundError), _told(f"Cannot delete {prefix}"):
             await self._place.delete_folder(folder, keep)
 
     async def sha256(self, key: str) -> str:
-        """The digest of what is stored, in hex; raises `NotFound`."""
+        """The digest of the stored bytes, in hex; raises `NotFound`."""
         digest = hashlib.sha256()
         async for chunk in self.read(key):
             digest.update(chunk)
@@ -208,7 +208,7 @@ class FileStore:
         return total
 
     async def signed_urls(self, method: Method, keys: Sequence[str], valid_s: int) -> Sequence[str] | None:
-        """An address for each key, good for ``valid_s`` and one method; none where the place cannot."""
+        """A URL for each key, valid for ``valid_s`` and one method; None if the place has no such URLs."""
         with _told("Cannot sign an address"):
             return await self._place.signed_urls(method, [_checked(key) for key in keys], valid_s)
 
@@ -241,7 +241,7 @@ def open_files(settings: Settings, *, patience_s: float = 15.0) -> FileStore:
 
 @contextlib.contextmanager
 def _told(what: str) -> Iterator[None]:
-    """The store's own errors in the engine's words; theirs, which name paths and hosts, are for the log alone."""
+    """Translates the store's errors into the engine's; the originals name paths and hosts, so only the log has them."""
     try:
         yield
     except BaseError as error:

@@ -1,4 +1,4 @@
-"""A stream of bytes on its way into the store."""
+"""A byte stream that is measured on its way into the store."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from workers.settings.errors import LimitReached
 
 
 class MeasuredStream:
-    """A stream that is counted and hashed as it passes. ``failure`` is what it ended with, if not well."""
+    """Counts and hashes a stream as it passes. ``failure`` is the error that ended it, if any."""
 
     def __init__(self, key: str, chunks: AsyncIterable[bytes], limit: int, expected: str | None) -> None:
         self._key, self._limit, self._expected = key, limit, expected
@@ -24,7 +24,7 @@ class MeasuredStream:
         return self._digest.hexdigest()
 
     async def first(self, size: int) -> bytes:
-        """Up to about ``size`` bytes from the start; then `ended` says whether that was all."""
+        """About the first ``size`` bytes; afterwards, `ended` says whether that was all."""
         head = bytearray()
         while len(head) <= size:
             chunk = await self._next()
@@ -34,7 +34,7 @@ class MeasuredStream:
         return bytes(head)
 
     async def all_with(self, head: bytes) -> AsyncIterator[bytes]:
-        """``head`` and what follows it."""
+        """``head`` and the rest of the stream."""
         yield head
         try:
             while (chunk := await self._next()) is not None:

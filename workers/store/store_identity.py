@@ -1,7 +1,6 @@
-"""Every process of an installation must see the same files: the database and the store know each other by a mark.
+"""Ensures that all processes of an installation see the same files: database and store share a mark.
 
-So a second host whose files lie in a folder of its own, or a wrong bucket, is noticed at its start and not when a
-job misses its images.
+So a second host with its own folder, or a wrong bucket, is noticed at the start and not when a job misses its images.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ MARK_BYTES = 64
 
 
 async def require_same_store(database: Database, files: FileStore) -> None:
-    """Marks a new pair of database and store; raises `SetupError` where they belong to others, or are away."""
+    """Marks a new pair of database and store; raises `SetupError` if the marks differ, or one is away."""
     try:
         async with database.transaction() as connection:
             await connection.execute("SELECT pg_advisory_xact_lock(%s)", (MARK_LOCK,))
@@ -29,7 +28,7 @@ async def require_same_store(database: Database, files: FileStore) -> None:
                 await files.put_bytes(MARK_KEY, known.encode())
                 await connection.execute("INSERT INTO file_store (id) VALUES (%s)", (known,))
             elif known is None:
-                # A store with a past under a new database: a restore, or a second schema. Its keys never collide.
+                # An existing store with a new database: a restore, or a second schema. Keys never collide.
                 await connection.execute("INSERT INTO file_store (id) VALUES (%s)", (found,))
                 known = found
     except Unavailable as error:

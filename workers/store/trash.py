@@ -1,7 +1,7 @@
 """Folders to delete, listed in the transaction that makes them garbage and deleted later by the janitors.
 
-A folder whose files are to be recorded is listed before they are stored, and taken off the list in the transaction that
-records them: so a process that is killed in between leaves nothing behind.
+A new folder is listed before its files are stored, and taken off the list in the transaction that records them, so a
+process that is killed in between leaves nothing behind.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from workers.store.files import FileStore
 log = logging.getLogger(__name__)
 
 FOLDERS_AT_ONCE = 20
-# When a folder is tried again that could not be deleted: the store answered with an error, or a file came late.
+# Pause before a retry of a folder that could not be deleted: the store failed, or a file came late.
 RETRY_S = 60.0
-# The folder of a whole job or dataset, as opposed to a checkpoint that was replaced.
+# The folder of a whole job or dataset, as opposed to a replaced checkpoint.
 _WHOLE = re.compile(r"(jobs|datasets)/[^/]+")
 
 
 async def discard(
     connection: Connection, folder: str, *, after_s: float = 0.0, keep: str | None = None
 ) -> None:
-    """Have a folder deleted, after ``after_s`` and except its sub-folder named ``keep``."""
+    """List a folder for deletion after ``after_s``, except its sub-folder named ``keep``."""
     await connection.execute(
         "INSERT INTO trash (prefix, keep, not_before)"
         " VALUES (%s, %s, clock_timestamp() + make_interval(secs => %s))",
@@ -34,7 +34,7 @@ async def discard(
 
 
 async def rescue(connection: Connection, folder: str) -> None:
-    """Keep a folder that was to be deleted; raises `Unavailable` where it may be gone already."""
+    """Take a folder off the list; raises `Unavailable` if it may be deleted already."""
     sql = "DELETE FROM trash WHERE prefix = %s AND not_before > clock_timestamp() RETURNING id"
     if await connection.row(sql, folder) is None:
         raise Unavailable(
@@ -43,12 +43,12 @@ async def rescue(connection: Connection, folder: str) -> None:
 
 
 async def forget(connection: Connection, folder: str) -> None:
-    """Keep a folder that was to be deleted, where it may be gone already without harm."""
+    """Take a folder off the list; it may harmlessly be deleted already."""
     await connection.execute("DELETE FROM trash WHERE prefix = %s", (folder,))
 
 
 async def delete_unless_rescued(database: Database, files: FileStore, folder: str) -> None:
-    """Delete a listed folder now; where the database is away, a janitor does it in its time."""
+    """Delete a folder now if it is still listed; if the database is away, a janitor does it later."""
     listed = "UPDATE trash SET not_before = clock_timestamp() WHERE prefix = %s RETURNING id"
     try:
         if await database.fetch(listed, folder):
@@ -60,11 +60,11 @@ async def delete_unless_rescued(database: Database, files: FileStore, folder: st
 async def empty_trash(database: Database, files: FileStore) -> None:
     """Delete the folders that are due, at most 20. Raises `Unavailable`.
 
-    Outside of a transaction: a thousand files in a bucket take their time. Safe to run concurrently. What cannot be
-    deleted is tried again later, after what is due by then.
+    Not in a transaction: deleting a thousand files in a bucket takes long. Safe to run concurrently. Failed deletions
+    are retried later, after folders that are due by then.
     """
     for row in await database.fetch(
-        # What is being rescued just now is passed over.
+        # Skips folders that are being rescued.
         "SELECT id, prefix, keep FROM trash WHERE not_before <= clock_timestamp() ORDER BY id LIMIT %s"
         " FOR UPDATE SKIP LOCKED",
         FOLDERS_AT_ONCE,
@@ -90,7 +90,7 @@ async def _try_later(database: Database, row_id: int) -> None:
 
 
 async def _delete(files: FileStore, folder: str, keep: str | None) -> tuple[list[int], int]:
-    """Sizes of the files that were there, and how many there still are."""
+    """Deletes the files; returns their sizes, and how many are left."""
     found = await _sizes(files, folder, keep)
     await files.delete_prefix(folder, keep=keep)
     return found, len(await _sizes(files, folder, keep))

@@ -1,4 +1,4 @@
-"""API keys: made, found again by what a client sends, listed, revoked. Only their SHA-256 is stored."""
+"""API keys: created, recognised, listed, revoked. Only their SHA-256 is stored."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from workers.tenants.tokens import living_row, new_token
 Scope = Literal["read", "datasets:write", "jobs:write", "admin"]
 ALL_SCOPES: frozenset[Scope] = frozenset(get_args(Scope))
 USUAL_SCOPES: tuple[Scope, ...] = ("read", "datasets:write", "jobs:write")
-# Not a write for each request of a busy client.
+# Limits writes: not one per request of a busy client.
 _USED_EVERY_S = 60
-# How long "no key was made yet" is believed.
+# How long "no key exists yet" is cached.
 NONE_MADE_S = 1.0
 
 
@@ -42,7 +42,7 @@ class ApiKey(Record):
 
 
 class KeyRefused(Exception):
-    """The key is unknown, expired or revoked. Says no more: a caller must not learn which."""
+    """The key is unknown, expired or revoked. Says no more: a client must not learn which."""
 
 
 class KeyStore:
@@ -60,7 +60,7 @@ class KeyStore:
     async def create(
         self, tenant: str, name: str, scopes: Iterable[Scope], *, lives: timedelta | None = None
     ) -> tuple[ApiKey, str]:
-        """A new key and its text, which cannot be read again; makes the tenant if it is new.
+        """A new key and its text, which cannot be read again; creates the tenant if needed.
 
         Raises `InputError` (``bad_tenant``, ``bad_scope``).
         """
@@ -83,7 +83,7 @@ class KeyStore:
         return _key(row), text
 
     async def recognise(self, text: str) -> ApiKey:
-        """The living key with this text; notes its use. Raises `KeyRefused`."""
+        """The valid key with this text; records its use. Raises `KeyRefused`."""
         select = (
             "SELECT *, revoked_at IS NULL AND coalesce(expires_at > clock_timestamp(), true) AS living,"
             " coalesce(last_used_at < clock_timestamp() - make_interval(secs => %s), true) AS stale"
@@ -99,12 +99,12 @@ class KeyStore:
         return _key(row)
 
     async def any_made(self) -> bool:
-        """Whether a key was ever made. A revoked one counts: revoking the last must not open the doors.
+        """Whether a key was ever created. Revoked ones count: revoking the last must not open the service.
 
-        Each request without a key asks, so "yes" is remembered for good and "no" for `NONE_MADE_S`.
+        Each request without a key calls this, so "yes" is cached forever and "no" for `NONE_MADE_S`.
         """
         if not self._any_made and time.monotonic() - self._asked_at >= NONE_MADE_S:
-            if self._asking is None:  # one question for all who ask meanwhile
+            if self._asking is None:  # one query for all concurrent callers
                 self._asking = asyncio.create_task(self._ask())
             await asyncio.shield(self._asking)
         return self._any_made
@@ -125,7 +125,7 @@ class KeyStore:
         return tuple(_key(row) for row in rows)
 
     async def revoke(self, key_id: str) -> ApiKey:
-        """End a key for good, from the next request on; raises `NotFound`."""
+        """Revoke a key for good, from the next request on; raises `NotFound`."""
         sql = "UPDATE api_keys SET revoked_at = coalesce(revoked_at, clock_timestamp()) WHERE id = %s RETURNING *"
         async with self._database.transaction() as connection:
             return _key(await connection.required_row(f"No key {key_id}.", sql, key_id))

@@ -1,7 +1,7 @@
-"""Tenants: who owns datasets and jobs, what share of the service each gets, and how much of it at most.
+"""Tenants: the owners of datasets and jobs, with their shares of the service and their limits.
 
-A store bound to a tenant sees nothing of the others. Turns and limits are kept by the database itself
-(`give_turn` in its schema), so they hold for every way a job comes in.
+A store bound to a tenant sees nothing of others. The database itself keeps turns and limits (`give_turn` in its
+schema), so they hold for every way to submit a job.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from workers.records import PRIORITIES, priority_name
 from workers.settings.errors import NotFound
 from workers.settings.settings import Settings
 
-# Whoever runs the machine; owns everything while no key is needed.
+# The user of the machine; owns everything while no key is needed.
 LOCAL_TENANT = "local"
 TENANT_FORM = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
 
@@ -35,7 +35,7 @@ class TenantStore:
         self._database = database
 
     async def apply_defaults(self, settings: Settings) -> None:
-        """Make the limits of the settings those of every tenant that has none of its own."""
+        """Apply the settings' limits to all tenants without explicit ones."""
         values = (
             *(settings.tenant_max_running, settings.tenant_max_queued),
             *(settings.tenant_max_stored_bytes, settings.tenant_max_daily_seconds),
@@ -47,14 +47,14 @@ class TenantStore:
         )
 
     async def share(self, tenant: str) -> TenantShare:
-        """The tenant's share and use of it; raises `NotFound`."""
+        """The tenant's share, limits and current use; raises `NotFound`."""
         shares = await self.shares(tenant)
         if not shares:
             raise NotFound(f"No tenant {tenant}.")
         return shares[0]
 
     async def shares(self, tenant: str | None = None) -> tuple[TenantShare, ...]:
-        """All tenants, by name, or the one."""
+        """All tenants, by name, or the given one."""
         rows = await self._database.fetch(
             "SELECT tenant_limits.*, coalesce(running, 0) AS running, coalesce(queued, 0) AS queued,"
             " stored_bytes_of(id) AS stored_bytes, seconds_today(id) AS seconds_today"
@@ -74,7 +74,7 @@ class TenantStore:
         tenant: str | None,
         limit: int,
     ) -> tuple[UsageRow, ...]:
-        """What attempts used that ended from ``first`` to ``last`` (UTC), of all tenants or one: sums ``by`` these."""
+        """Use by attempts that ended from ``first`` to ``last`` (UTC), of all tenants or one, summed ``by`` these."""
         columns = sql.SQL(", ").join(sql.Identifier("key_id" if key == "key" else key) for key in by)
         rows = await self._database.fetch(
             sql.SQL(
@@ -98,7 +98,7 @@ class TenantStore:
         max_stored_bytes: int | None = None,
         max_daily_seconds: int | None = None,
     ) -> TenantShare:
-        """Change what is given (a limit of -1: what the settings say again); makes the tenant if it is new.
+        """Change the given values (a limit of -1: back to the settings'); creates the tenant if needed.
 
         Raises `InputError` (``bad_tenant``).
         """
@@ -118,7 +118,7 @@ class TenantStore:
 
 
 def checked_tenant(name: str) -> str:
-    """The name; raises `InputError` (``bad_tenant``) where it cannot be one."""
+    """The name; raises `InputError` (``bad_tenant``) if it is not valid."""
     if not TENANT_FORM.fullmatch(name):
         raise InputError(
             "bad_tenant",
@@ -130,7 +130,7 @@ def checked_tenant(name: str) -> str:
 
 
 async def ensure_tenant(connection: Connection, name: str) -> None:
-    """Makes the tenant where there is none of that name; raises `InputError` (``bad_tenant``)."""
+    """Creates the tenant if it does not exist; raises `InputError` (``bad_tenant``)."""
     await connection.execute(
         "INSERT INTO tenants (id) VALUES (%s) ON CONFLICT DO NOTHING", (checked_tenant(name),)
     )

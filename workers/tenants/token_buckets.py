@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from workers.database.database import Connection, Database
 
-# One statement, so that no two requests take the same token. A refused request writes nothing. The second part reads
-# what was before the statement: none where another request has just used up a new bucket.
+# One statement, so that no two requests take the same token. A refused request writes nothing. The second part sees the
+# state before the statement: no row if another request has just used up a new bucket.
 _TAKE = """
     WITH taken AS (
         INSERT INTO token_buckets AS bucket (policy, client, full_at)
@@ -53,5 +53,5 @@ class TokenBuckets:
 
 
 async def forget_full_buckets(connection: Connection) -> None:
-    """A client without a row has a full bucket."""
+    """Delete full buckets: a client without a row has one."""
     await connection.execute("DELETE FROM token_buckets WHERE full_at < clock_timestamp()")

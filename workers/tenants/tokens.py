@@ -1,6 +1,6 @@
-"""Texts that let their holder in: made once, and found again by what is sent. Only their SHA-256 is stored.
+"""Secret tokens: shown once, and recognised when a client sends them. Only their SHA-256 is stored.
 
-A text is its kind, as `brn`, ten characters that may be shown, and 256 random bits.
+A token's text is its kind, such as `brn`, ten characters that may be shown, and 256 random bits.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _NOBODY = bytes(32)
 
 
 class Token(NamedTuple):
-    """A new one: how it begins, the whole text, which cannot be read again, and its digest."""
+    """A new token: its prefix, its text, which cannot be read again, and its digest."""
 
     prefix: str
     text: str
@@ -28,7 +28,7 @@ class Token(NamedTuple):
 
 
 def new_token(kind: str) -> Token:
-    """A token that nobody can guess."""
+    """A new token, which nobody can guess."""
     prefix = f"{kind}_" + "".join(secrets.choice(CROCKFORD) for _ in range(10))
     text = f"{prefix}_{secrets.token_urlsafe(32)}"
     return Token(prefix, text, _digest(text))
@@ -37,13 +37,13 @@ def new_token(kind: str) -> Token:
 async def living_row(
     database: Database, kind: str, text: str, select: LiteralString, *values: object
 ) -> DictRow | None:
-    """The row of the token with this text; None says no more than that there is none, or that it lives no more.
+    """The row of the valid token with this text; None if there is none or it is no longer valid.
 
-    ``select`` takes the ``values`` and then the prefix, and gives `sha256` and `living`. Raises `Unavailable`.
+    ``select`` takes the ``values`` and then the prefix, and returns `sha256` and `living`. Raises `Unavailable`.
     """
     form = re.fullmatch(rf"({kind}_[0-9A-Z]{{10}})_[A-Za-z0-9_-]{{43}}", text, re.ASCII)
     rows = await database.fetch(select, *values, form[1]) if form else []
-    # The same work whether the prefix is known or not; equal in time for each wrong digest.
+    # Takes the same time whether or not the prefix is known, and for each wrong digest.
     same = hmac.compare_digest(_digest(text), bytes(rows[0]["sha256"]) if rows else _NOBODY)
     return rows[0] if same and rows and rows[0]["living"] else None
 

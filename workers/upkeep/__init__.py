@@ -1,1 +1,1 @@
-"""What runs beside requests and jobs: dispatcher, expiry, backup, supervision."""
+"""Work besides requests and jobs: dispatcher, expiry, backup, supervision."""

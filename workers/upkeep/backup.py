@@ -1,6 +1,6 @@
 """Makes a backup while the service runs: all files, then a database snapshot and the files added since.
 
-This keeps the time short in which a running job could replace a checkpoint that the snapshot names.
+This leaves little time for a running job to replace a checkpoint that the snapshot names.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ _STEPS = "SELECT name FROM schema_steps ORDER BY name"
 async def make_backup(settings: Settings, url: str, folder: Path) -> BackupIndex:
     """Update the backup in ``folder`` from the database at ``url`` and its files; returns its index.
 
-    ``gone`` of the index lists files deleted during the backup. Raises `SetupError` (also where the backup there is of
-    another store), `Unavailable` (the store), `OSError` (the folder); the previous backup then stays complete.
+    ``gone`` of the index lists files deleted during the backup. Raises `SetupError` (also if the folder holds another
+    store's backup), `Unavailable` (the store), `OSError` (the folder); the previous backup then stays complete.
     """
     _prepare(folder)
     before = {file.key: file for file in read_index(folder).files} if (folder / INDEX_NAME).exists() else {}

@@ -1,4 +1,4 @@
-"""A backup on disk: a database dump, a copy of every file, and an index of what belongs together.
+"""A backup on disk: a database dump, a copy of every file, and an index of both.
 
 ``backup.json`` is written last and replaced atomically, so a folder holds one complete backup or none. Files never
 change under their key, so the next backup into the folder copies only new ones.
@@ -39,7 +39,7 @@ class SavedFile(Record):
 
 
 class BackupIndex(Record):
-    """One whole backup."""
+    """The index of one complete backup."""
 
     version: str
     made_at: datetime
@@ -71,7 +71,7 @@ def path_in(folder: Path, key: str) -> Path:
 
 
 async def marks(store: FileStore, folder: Path) -> tuple[bytes | None, bytes | None]:
-    """The marks of the store and of the backup, by which they know their database; None where there is none yet."""
+    """The marks of the store and of the backup, which identify their database; None if not set yet."""
     found = ours = None
     with contextlib.suppress(NotFound):
         found = b"".join([chunk async for chunk in store.read(MARK_KEY)])
@@ -87,7 +87,7 @@ def sha256_of(path: Path) -> str:
 
 
 def postgres_program(settings: Settings, name: str) -> str:
-    """Path of ``pg_dump``, ``pg_restore`` or ``psql``; raises `SetupError` where there is none."""
+    """Path of ``pg_dump``, ``pg_restore`` or ``psql``; raises `SetupError` if there is none."""
     program = find_binaries(settings.pg_bin) / name
     if not program.is_file():
         raise SetupError(
@@ -97,7 +97,7 @@ def postgres_program(settings: Settings, name: str) -> str:
 
 
 def connection_of(url: str) -> tuple[str, dict[str, str]]:
-    """The option that leads such a program to the database at ``url``, and its environment.
+    """The option with which such a program connects to the database at ``url``, and its environment.
 
     The password is not on the command line, which every user of the machine can read.
     """

@@ -1,6 +1,6 @@
-"""Sends files of jobs that are over to addresses of their owners': a dispatcher's work, like the webhooks.
+"""Sends files of finished jobs to their owners' addresses; runs in dispatchers, like webhooks.
 
-Addresses are secrets: no log and no error contains more of them than the host.
+Addresses are secrets: logs and errors contain only their host.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from workers.webhooks.webhook_sender import ROUNDS_MAX
 
 log = logging.getLogger(__name__)
 
-# Stores take no more in one request, and larger zips are of a form that some programs cannot read.
+# Stores accept no more in one request, and some programs cannot read the format of larger zips.
 ZIP_BYTES_MAX = 2**31 - 1
 
 
@@ -61,7 +61,7 @@ class Deliverer(TransferWork):
 
     async def _transfer(self, row: dict[str, Any]) -> None:
         found = await self._jobs.artifacts(row["job_id"])
-        if not found:  # as of a job that ended before it ran
+        if not found:  # for example, the job ended before it ran
             raise TransferFailed("The job has no files.", code="not_found")
         if row["name"] is None:
             size, chunks, kind = zip_bytes(found), zipped(self._files, found), "application/zip"
@@ -90,7 +90,7 @@ class Deliverer(TransferWork):
 
 
 class _Written:
-    """Takes what a zip file writes; having no places, it makes the zip one that is written in one go."""
+    """Collects what a zip file writes; it cannot seek, so the zip is written as a stream."""
 
     def __init__(self) -> None:
         self._parts: list[bytes] = []
@@ -100,7 +100,7 @@ class _Written:
         return len(part)
 
     def flush(self) -> None:
-        """Nothing is held back."""
+        """Nothing to do: writes are not buffered."""
 
     def taken(self) -> bytes:
         """What was written since the last call."""
@@ -109,7 +109,7 @@ class _Written:
 
 
 def zip_bytes(artifacts: Sequence[Artifact]) -> int:
-    """The size of the zip of these files: of one of empty files with the same names, and their contents."""
+    """The size of the zip of these files: that of empty files with the same names, plus their contents."""
     written = _Written()
     with zipfile.ZipFile(written, "w") as archive:  # type: ignore[call-overload]
         for artifact in artifacts:
@@ -118,7 +118,7 @@ def zip_bytes(artifacts: Sequence[Artifact]) -> int:
 
 
 async def zipped(files: FileStore, artifacts: Sequence[Artifact]) -> AsyncIterator[bytes]:
-    """The zip of these files, not compressed, so that its size is known before."""
+    """The zip of these files, not compressed, so that its size is known in advance."""
     written = _Written()
     with zipfile.ZipFile(written, "w") as archive:  # type: ignore[call-overload]
         for artifact in artifacts:

@@ -1,7 +1,7 @@
-"""The dispatcher: a small process that sends webhooks, fetches and delivers files, and expires results and datasets.
+"""The dispatcher: sends webhooks, fetches and delivers files, and expires results and datasets.
 
-Several may run at the same time, on any hosts: each message and file is claimed by one of them. Jobs need none of them;
-while no dispatcher runs, messages and files wait.
+Several may run at the same time, on any hosts: each message and file is claimed by one of them. Jobs need no
+dispatcher; without one, messages and files wait.
 """
 
 from __future__ import annotations

@@ -31,10 +31,10 @@ from workers.store.trash import discard
 log = logging.getLogger(__name__)
 
 BATCH = 100
-# A dataset that is locked is in use, and looked at again. Submits share its lock: where they overlap without a gap,
-# who waits for them would wait for ever.
+# A locked dataset is in use, and tried again later. Submissions share its lock: waiting for overlapping ones could last
+# forever.
 _UNUSED = "SELECT 1 FROM datasets WHERE id = %s FOR UPDATE SKIP LOCKED"
-# One dispatcher at a time keeps the dates up and deletes; the others have webhooks to send.
+# Only one dispatcher at a time updates the dates and deletes.
 EXPIRY_LOCK = 7_201_606
 _DATE_DATASETS = """
     UPDATE datasets SET expires_at = due.at FROM (
@@ -49,15 +49,15 @@ _DATE_ALL = _DATE_DATASETS.format(used="", dated="")
 _DATE_CHANGED = _DATE_DATASETS.format(
     used="WHERE dataset_id = ANY(%(ids)s)", dated="AND kept.id = ANY(%(ids)s)"
 )
-# All dates are looked over so often: a setting may have changed, a job's record may be gone.
+# How often all dates are updated: a setting may have changed, a job's record may be gone.
 ALL_S = 3600.0
-# Changes of so long ago are looked at again: their transaction may have ended after the last round.
+# Overlap of rounds: a transaction may have committed after the round that it belongs to.
 OVERLAP_S = 600.0
 DAY_S = 86_400.0
 
 
 class Expiry:
-    """Rounds of the dispatcher."""
+    """The dispatcher's rounds of expiry."""
 
     def __init__(self, database: Database, settings: Settings) -> None:
         self._database, self._settings = database, settings
@@ -65,7 +65,7 @@ class Expiry:
         self._looked_at: datetime | None = None
 
     async def run(self, stop: asyncio.Event) -> None:
-        """A round every ``expiry_s`` seconds until ``stop``."""
+        """Run a round every ``expiry_s`` seconds until ``stop``."""
         while not stop.is_set():
             try:
                 await self.round()
@@ -74,7 +74,7 @@ class Expiry:
             await first_done(stop.wait(), asyncio.sleep(self._settings.expiry_s))
 
     async def round(self) -> None:
-        """Update the dates of expiry, and expire what is due; raises `Unavailable`."""
+        """Update expiry dates, and expire what is due; raises `Unavailable`."""
         if not await self._set_dates():
             return
         for expire in (self._expire_jobs, self._expire_datasets):
@@ -83,14 +83,14 @@ class Expiry:
         await self._forget()
 
     async def _set_dates(self) -> bool:
-        """Whether it was ours to do; another dispatcher does it otherwise."""
+        """Update expiry dates; returns False if another dispatcher is in charge."""
         results_s, datasets_s = (
             days * DAY_S or None
             for days in (self._settings.keep_results_days, self._settings.keep_datasets_days)
         )
         async with self._database.transaction() as connection:
             if not await _mine(connection):
-                # The other one may have other settings, and end at any time.
+                # The other one may have different settings, and may end at any time.
                 self._looked_at = None
                 return False
             now = await connection.value("SELECT clock_timestamp()")
@@ -117,10 +117,10 @@ class Expiry:
         return sum([await self._expire_dataset(row["id"]) for row in rows])
 
     async def _expire_dataset(self, dataset_id: str) -> bool:
-        """Whether it is looked after: not where it is in use at this moment."""
+        """Expire a dataset if it is due; returns False if it is in use."""
         kept_s = self._settings.keep_datasets_days * DAY_S
         async with self._database.transaction() as connection:
-            # The lock first: a submit that came before it is seen by the next statement, one after it sees us.
+            # Lock first: the next statement sees earlier submissions, and later ones see ours.
             if await connection.row(_UNUSED, dataset_id) is None:
                 return False
             row = await connection.row(
@@ -150,7 +150,7 @@ class Expiry:
         return True
 
     async def _forget(self) -> None:
-        """Idempotency keys a while after their jobs; then the records of what expired, and of deliveries."""
+        """Release idempotency keys, then delete old records of expired data and of deliveries."""
         await self._database.run(forget_keys, self._settings.keep_keys_hours * 3600)
         if not self._settings.keep_records_days:
             return
@@ -160,7 +160,7 @@ class Expiry:
             "DELETE FROM datasets WHERE state = 'expired'"
             " AND expires_at < now() - make_interval(secs => %s)"
             " AND NOT EXISTS (SELECT 1 FROM dataset_jobs WHERE dataset_id = datasets.id)",
-            # Waits for nobody: deleting a webhook locks the same rows in another order.
+            # Skips locked rows: deleting a webhook locks them in another order.
             "DELETE FROM webhook_deliveries WHERE id IN (SELECT id FROM webhook_deliveries"
             " WHERE finished_at < now() - make_interval(secs => %s) FOR UPDATE SKIP LOCKED)",
         ):

@@ -1,4 +1,4 @@
-"""Whether what the service needs is there, and the figures of the whole installation."""
+"""Checks what the service needs, and reads the figures of the whole installation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from workers.settings.errors import Unavailable
 from workers.store.files import FileStore
 
 Need = Literal["database", "storage", "queue"]
-# A probe that waits longer than its caller tells nothing.
+# A probe must answer before its caller gives up.
 CHECK_S = 2.0
 FAILURES_SHOWN = 20
 _SLOTS = """
@@ -34,14 +34,14 @@ _FAILURES = "SELECT * FROM failed_jobs ORDER BY finished_at DESC LIMIT %s"
 
 
 class Monitor:
-    """Looks without changing anything. Get one from `workers.engine.open_stores`."""
+    """Read-only monitoring. Get one from `workers.engine.open_stores`."""
 
     def __init__(self, database: Database, files: FileStore, stall_s: float) -> None:
         self._database, self._files, self._stall_s = database, files, stall_s
 
     @property
     def broken(self) -> asyncio.Event:
-        """Set once this process lost connections to the database for good."""
+        """Set once this process has lost database connections for good."""
         return self._database.broken
 
     async def statistics(self) -> Statistics:
@@ -49,7 +49,7 @@ class Monitor:
         return await read_statistics(self._database, self._stall_s)
 
     async def overview(self) -> OperatorView:
-        """What its operator wants to see of the installation; raises `Unavailable`."""
+        """The operator's view of the installation; raises `Unavailable`."""
         async with self._database.transaction() as connection:
             await connection.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ READ ONLY")
             counts = {row["priority"]: row for row in await connection.rows("SELECT * FROM unfinished_jobs")}
@@ -75,7 +75,7 @@ class Monitor:
         return int(row["n"])
 
     async def lacking(self) -> dict[Need, str]:
-        """What is not as it has to be, and why; empty where jobs can be taken. Answers within seconds."""
+        """What is unavailable, and why; empty if jobs can be accepted. Returns within seconds."""
         needs: dict[Need, Awaitable[str]] = {
             "database": self._database_problem(),
             "storage": self._storage_problem(),
@@ -100,7 +100,7 @@ class Monitor:
 
 async def _in_time(check: Awaitable[str]) -> str:
     asked = asyncio.ensure_future(check)
-    # A query is cancelled by asking the server, which takes long where that is frozen: nobody waits for it here.
+    # Cancelling a query sends a request to the server, which may be frozen: do not wait for it.
     asked.add_done_callback(lambda done: done.cancelled() or done.exception())
     try:
         await asyncio.wait({asked}, timeout=CHECK_S)

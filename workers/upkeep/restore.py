@@ -34,9 +34,8 @@ _TIMEOUT_OF_ANY = (
 async def restore_backup(settings: Settings, url: str, folder: Path) -> BackupIndex:
     """Put the backup in ``folder`` into the empty database at ``url`` and the file store of the settings.
 
-    Every file is checked against its digest on the way. A backup of an older version is brought up to date.
-    Where it stops, it may be begun again. Raises `SetupError` (no whole backup, a database that is not empty,
-    damaged files), `Unavailable` (the store).
+    Every file is checked against its digest. A backup of an older version is migrated. If it fails, it can be repeated.
+    Raises `SetupError` (no whole backup, a database that is not empty, damaged files), `Unavailable` (the store).
     """
     index = read_index(folder)
     _require_empty(url)
@@ -54,9 +53,9 @@ async def restore_backup(settings: Settings, url: str, folder: Path) -> BackupIn
 
 
 def _restore_database(settings: Settings, url: str, dump: Path) -> None:
-    """Run the dump's SQL as one transaction; raises `SetupError`, the database being as it was.
+    """Run the dump's SQL in one transaction; raises `SetupError` and leaves the database unchanged.
 
-    pg_restore itself could not fill a server before 17: it sends `_TIMEOUT`, whatever the server's version.
+    pg_restore alone fails on servers before 17: it sends `_TIMEOUT` to any version.
     """
     making = [
         postgres_program(settings, "pg_restore"),
@@ -82,7 +81,7 @@ def _restore_database(settings: Settings, url: str, dump: Path) -> None:
     ):
         assert made.stdout is not None
         assert run.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # psql has ended, and said why
+        with contextlib.suppress(BrokenPipeError):  # psql has ended, with an error message
             run.stdin.write(b"BEGIN;\n")
             run.stdin.writelines(_TIMEOUT_OF_ANY if line == _TIMEOUT else line for line in made.stdout)
             if made.wait() == 0:
@@ -97,7 +96,7 @@ def _restore_database(settings: Settings, url: str, dump: Path) -> None:
 
 
 def _forget_lost_checkpoints(url: str, index: BackupIndex) -> None:
-    """A job whose checkpoint was replaced while the backup was made starts over."""
+    """Make jobs start over whose checkpoints were replaced during the backup."""
     lost = list({key.rpartition("/")[0] for key in index.gone})
     with psycopg.connect(url, connect_timeout=10) as connection:
         connection.execute(FORGET_CHECKPOINTS, (lost,))
@@ -115,7 +114,7 @@ def _require_empty(url: str) -> None:
 
 
 async def _require_own_store(store: FileStore, folder: Path) -> None:
-    """The store must be new, or hold what a restore of this backup began; its mark tells."""
+    """Require a new store, or one with this backup's mark, from an earlier restore."""
     found, ours = await marks(store, folder)
     if found is not None and ours is not None and found != ours:
         raise SetupError(

@@ -1,4 +1,4 @@
-"""Keeps the processes of one machine running: the private database, if any, and the commands it is given."""
+"""Keeps the processes of one machine running: the private database, if any, and the given commands."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 FIRST_PAUSE_S = 0.2
 LONGEST_PAUSE_S = 10.0
-# A process that never lived so long, in so many starts, has a fault that starting it again will not fix.
+# A process that died sooner in each of so many starts has a fault that a restart will not fix.
 SETTLED_S = 5.0
 STARTS_MAX = 5
 KILL_AFTER_S = 5.0
@@ -78,9 +78,9 @@ async def supervise(
 
     Without ``settings.database_url`` a private PostgreSQL is started first. The database is migrated, and
     children find its address in BIRESNERF_DATABASE_URL. Every child is restarted when it ends, with growing
-    pauses, and dies with this process. ``on_ready`` gets the database's address once all were started.
+    pauses, and dies with this process. ``on_ready`` gets the database's address once all have started.
 
-    Raises `SetupError` where the database cannot be started or migrated.
+    Raises `SetupError` if the database cannot be started or migrated.
     """
     postgres = None
     if settings.database_url is None:
@@ -92,7 +92,7 @@ async def supervise(
         url = postgres.url if postgres is not None else settings.require_database_url()
         migrate(url)
         if postgres is not None:
-            # We hold the lock of the folder, and all workers died with our predecessor: no job runs.
+            # We hold the folder's lock, and all workers died with our predecessor, so no job is running.
             async with open_database(url, connections=1) as database:
                 await release_worker(database, None, settings.stall_s)
         return await _Supervisor(settings, url, postgres, children).run(on_ready)
@@ -102,12 +102,12 @@ async def supervise(
 
 
 async def keep_running(settings: Settings, children: Sequence[ChildSpec]) -> int:
-    """The same for children alone, on a database that is there and migrated."""
+    """The same for children alone, with an existing, migrated database."""
     return await _Supervisor(settings, settings.require_database_url(), None, children).run(None)
 
 
 def _connections(settings: Settings) -> int:
-    """What all processes of this machine open at most, and some for the operator's commands."""
+    """Enough connections for all processes of this machine and the operator's commands."""
     return max(100, 20 + 10 * settings.processes + 8 * settings.slots)
 
 
@@ -150,7 +150,7 @@ class _Supervisor:
 
     def _asked_to_stop(self) -> None:
         if self._stop.is_set():
-            self._now.set()  # the second time without grace
+            self._now.set()  # kill at the second signal
         self._stop.set()
 
     async def _keep(self, spec: ChildSpec) -> None:
@@ -164,7 +164,7 @@ class _Supervisor:
                     start_new_session=True,
                     pass_fds=spec.descriptors,
                 )
-            except OSError as error:  # too many processes, or no memory for one more: that passes
+            except OSError as error:  # temporary: too many processes, or no memory for one more
                 log.error("%s cannot be started (%s); again in %.1f s", spec.name, error, LONGEST_PAUSE_S)
                 await first_done(asyncio.sleep(LONGEST_PAUSE_S), self._stop.wait())
                 continue

@@ -1,1 +1,1 @@
-"""Webhooks: kept, signed, sent."""
+"""Webhooks and all other outgoing requests."""

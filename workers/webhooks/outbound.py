@@ -1,8 +1,8 @@
-"""All outgoing requests, to addresses of users: POST of messages, GET and PUT of files; safe from forgery (SSRF).
+"""All outgoing requests to users' addresses, with protection against SSRF: POST messages, GET and PUT files.
 
 The host name is resolved once, all its addresses are checked, and the connection uses a checked address; TLS and
-the Host header keep the name. Redirects of a GET alone are followed, each new address is checked like the first, and
-its response body alone is read.
+the Host header keep the name. Only GET follows redirects, each checked like the first address, and only GET reads the
+response's body.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from workers.settings.settings import Settings
 # A signed address of a file is long: it may hold a session's token.
 URL_MAX, FILE_URL_MAX = 2000, 8000
 REDIRECTS, REDIRECTS_MAX = {301, 302, 303, 307, 308}, 5
-CONNECT_S = 10.0  # to one of a name's addresses; then the next is tried
-# Names resolved at the same time; more have to wait.
+CONNECT_S = 10.0  # per address of a name; then the next is tried
+# Names resolved at a time; others wait.
 RESOLVER_THREADS = 32
 _HOST = re.compile(rb"(?=.{1,253}$)([A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?\.)*[A-Za-z0-9-]{1,63}\.?")
 _LOCAL_SUFFIXES = (".localhost", ".local", ".internal", ".home.arpa")
@@ -40,7 +40,7 @@ Resolve = Callable[[str, int], Awaitable[Sequence[str]]]
 class Refused(Exception):
     """Nothing was sent; ``code`` says why.
 
-    ``address_refused``, ``name_not_found``, ``url_refused``, and of a GET ``too_many_redirects``.
+    ``address_refused``, ``name_not_found``, ``url_refused``, and for GET ``too_many_redirects``.
     """
 
     def __init__(self, code: str) -> None:
@@ -50,7 +50,7 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class Policy:
-    """Where the service may connect to; ``refusal`` is the code of the error about another address."""
+    """Where the service may connect to; ``refusal`` is the error code for other addresses."""
 
     plain_http: bool = False
     ports: tuple[int, ...] = (443,)  # none: any
@@ -60,12 +60,12 @@ class Policy:
 
     @classmethod
     def of(cls, settings: Settings) -> Policy:
-        """The policy of webhooks."""
+        """The policy for webhooks."""
         return cls(settings.webhook_http, settings.webhook_ports, settings.webhook_networks)
 
     @classmethod
     def of_files(cls, settings: Settings) -> Policy:
-        """The policy of files, of whose content users see more than of the answer to a webhook."""
+        """The policy for files, separate because users see their content, but little of the response to a webhook."""
         allowed = settings.file_address_http, settings.file_address_ports, settings.file_address_networks
         return cls(*allowed, FILE_URL_MAX, "address_refused")
 
@@ -165,18 +165,18 @@ class _CheckedBackend(httpcore.AsyncNetworkBackend):
 
 @dataclass(frozen=True)
 class Answer:
-    """A response: its status, and its headers by their names in lower case."""
+    """A response: status, and headers by lower-case name."""
 
     status: int
     headers: Mapping[str, str]
 
 
-# What can go wrong with a request that is not a fault of ours.
+# Errors of a request that are not our fault.
 TROUBLES = (Refused, TimeoutError, httpcore.TimeoutException, httpcore.NetworkError, httpcore.ProtocolError)
 
 
 def trouble_of(error: BaseException) -> tuple[str, bool]:
-    """The code of one of the `TROUBLES`, and whether another try may go better."""
+    """The code of one of the `TROUBLES`, and whether a retry may help."""
     if isinstance(error, Refused):
         return error.code, error.code == "name_not_found"
     if isinstance(error, httpcore.NetworkError):
@@ -219,7 +219,7 @@ class Outbound:
         size: int,
         timeout_s: float,
     ) -> Answer:
-        """Send a body of ``size`` bytes and return the first answer, whatever its status, without its body.
+        """Send a body of ``size`` bytes and return the first response, with any status, without its body.
 
         Raises `Refused`, `TimeoutError` (``timeout_s`` for the whole exchange), and httpcore's
         `NetworkError` and `ProtocolError`.
@@ -232,7 +232,7 @@ class Outbound:
     async def get(
         self, address: str, headers: Mapping[str, str], *, head_s: float, idle_s: float
     ) -> AsyncIterator[tuple[Answer, AsyncIterator[bytes]]]:
-        """The answer to a GET, whatever its status, after at most `REDIRECTS_MAX` redirects, and its body.
+        """The response to a GET, with any status, after at most `REDIRECTS_MAX` redirects, and its body.
 
         Raises as `send` does: `TimeoutError` after ``head_s`` until the last answer begins, or after ``idle_s``
         between two chunks of its body.
@@ -248,7 +248,7 @@ class Outbound:
                     address = _joined(address, answer.headers["location"])
                 else:
                     raise Refused("too_many_redirects")
-            chunks = aiter(response.aiter_stream())  # as they were sent: nothing is unpacked here
+            chunks = aiter(response.aiter_stream())  # as sent, without decompression
             yield answer, _steady(chunks, idle_s)
 
     @asynccontextmanager

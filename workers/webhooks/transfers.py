@@ -1,4 +1,4 @@
-"""What goes wrong where files come from or go to addresses of users, in words that hold no secret."""
+"""Transfers of files from and to users' addresses, with error messages that contain no secrets."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from workers.webhooks.webhook_sender import outcome_of, pause, retry_after
 
 log = logging.getLogger(__name__)
 
-# Until an answer's body begins, redirects included, and between two chunks of a body.
+# Time limits until a response's body begins, redirects included, and between two chunks of it.
 HEAD_S, IDLE_S = 60.0, 60.0
-# Who is slower, after a while, only occupies a place.
+# A slower host, after a while, only occupies a place.
 SLOWEST_BYTES_PER_S, SLOW_S = 200e3, 60.0
 _REFUSED = {"address_refused", "url_refused"}
 _WHY = {
@@ -37,9 +37,9 @@ _WHY = {
 
 
 class TransferFailed(Exception):
-    """A try came to nothing; ``again``: the next may do better, after ``wait_s`` at least.
+    """A try failed; ``again``: a retry may succeed, after ``wait_s`` at least.
 
-    Where no ``code`` is given, ``detail`` says what the host does.
+    Without a ``code``, ``detail`` is a predicate of the host, such as "redirects too often".
     """
 
     def __init__(self, detail: str, *, code: str = "", again: bool = False, wait_s: float = 0.0) -> None:
@@ -48,20 +48,20 @@ class TransferFailed(Exception):
 
     @classmethod
     def of_trouble(cls, trouble: BaseException) -> TransferFailed:
-        """Of one of the `TROUBLES` of a request."""
+        """The failure for one of the `TROUBLES` of a request."""
         code, again = trouble_of(trouble)
         return cls(_WHY[code], code="address_refused" if code in _REFUSED else "", again=again)
 
     @classmethod
     def of_answer(cls, answer: Answer) -> TransferFailed:
-        """Of an answer that is none of those hoped for."""
+        """The failure for an unexpected response."""
         expired = "; a signed address may have expired" if answer.status in {400, 401, 403} else ""
         again = outcome_of(answer.status) == "again"
         wait_s = retry_after(answer)
         return cls(f"answers {answer.status}{expired}", again=again, wait_s=wait_s)
 
     def error(self, host: str | None, where: str, code: str) -> JobError:
-        """What the user sees; ``code`` where the failure has none of its own."""
+        """The error that the user sees; ``code`` applies if the failure has none."""
         of_host = self.code in {"", "address_refused"}
         return JobError(
             code=self.code or code,
@@ -73,10 +73,10 @@ class TransferFailed(Exception):
 
 
 class TransferWork(LeasedWork):
-    """Files on their way from or to addresses of users, each row a file; tried again for as long as that may help."""
+    """Transfers from or to users' addresses, one file per row; retried while that may help."""
 
     rounds_max: ClassVar[int]
-    # What the work is free to raise: no failures of the transfer.
+    # Errors that pass through: they are no failures of the transfer.
     raised: ClassVar[tuple[type[FaultError], ...]] = (Unavailable,)
 
     def __init__(
@@ -90,7 +90,7 @@ class TransferWork(LeasedWork):
         """One try."""
 
     async def _attempt(self, row: dict[str, Any]) -> TransferFailed | None:
-        """Why a try came to nothing; None where it did not."""
+        """Try once; returns the failure, None after success."""
         if row["losses"] >= LOSSES_MAX:
             return TransferFailed(f"was given up: {LOSSES_MAX} processes were lost during the transfer")
         try:
@@ -103,13 +103,13 @@ class TransferWork(LeasedWork):
             return TransferFailed(error.detail, code=error.code, again=error.code == "storage_full")
         except TROUBLES as trouble:
             return TransferFailed.of_trouble(trouble)
-        except Exception:  # a fault of ours must not repeat without end
+        except Exception:  # our own fault must not repeat forever
             log.exception("the transfer of %s failed", row["id"])
             return TransferFailed("could not be used, by a fault of the service", again=True)
         return None
 
     async def _comes_again(self, row: dict[str, Any], failed: TransferFailed, round_: int) -> bool:
-        """Whether there will be a try after this one, which ended the round of that number; then it is given back."""
+        """Whether a retry follows this try, which ended round ``round_``; if so, gives the row back."""
         if not failed.again or round_ >= self.rounds_max:
             return False
         wait_s = max(pause(max(round_, 1), self._settings.webhook_retry_s), failed.wait_s)

@@ -1,7 +1,7 @@
-"""Sends what waits in the outbox: each message is claimed by one process, signed, posted, and written down.
+"""Sends the messages in the outbox: each is claimed by one process, signed, posted, and recorded.
 
-A claim is a lease, so no transaction waits for a receiver, and what a killed process had claimed is sent again
-once the lease is over. Receivers see a message at least once, under the same id.
+A claim is a lease, so no transaction waits for a receiver, and messages of a killed process are sent again once the
+lease expires. Delivery is at least once; retries keep the message's id.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from workers.webhooks.webhooks import drop_pending
 
 log = logging.getLogger(__name__)
 
-# At the same time: by this process, to one receiver, to one that failed last time, to all of one tenant.
+# Concurrent messages: per process, per receiver, per receiver that failed last time, per tenant.
 IN_FLIGHT_MAX = 32
 PER_WEBHOOK, PER_FAILING, PER_TENANT = 4, 1, 8
 ROUNDS_MAX = 12
 PAUSE_FACTOR, PAUSE_MAX_S = 4.0, 12 * 3600.0
 JITTER = 0.2
-# Beyond the longest delivery: time to record its outcome.
+# Lease beyond the longest delivery: time to record the outcome.
 LEASE_SPARE_S = 30.0
 AGAIN = {408, 409, 429}
 Outcome = Literal["delivered", "again", "failed", "gone"]
@@ -66,7 +66,7 @@ _CLAIM = """
 
 @dataclass(frozen=True)
 class Result:
-    """What came of one attempt."""
+    """The result of one attempt."""
 
     outcome: Outcome
     status: int | None = None
@@ -75,7 +75,7 @@ class Result:
 
 
 class WebhookSender(ClaimedWork):
-    """Runs in every dispatcher; several may. At the end it finishes what is under way."""
+    """Runs in every dispatcher; several may. At shutdown it finishes what is under way."""
 
     at_once = IN_FLIGHT_MAX
 
@@ -114,7 +114,7 @@ class WebhookSender(ClaimedWork):
             code, again = trouble_of(error)
             return Result("again" if again else "failed", error=code)
         except Exception:
-            # Our own failure on this one message must not repeat every minute without end.
+            # Our own failure on one message must not repeat every minute forever.
             log.exception("webhook message %s could not be sent", headers["webhook-id"])
             return Result("again", error="internal")
         return Result(outcome_of(answer.status), answer.status, None, retry_after(answer))
@@ -123,7 +123,7 @@ class WebhookSender(ClaimedWork):
         self, connection: Connection, row: dict[str, Any], result: Result, at: datetime, seconds: float
     ) -> None:
         """Record the outcome. The state of the message changes only while the lease is ours."""
-        # First the webhook, then its messages: who deletes it locks them in this order.
+        # Locks the webhook before its messages, as deleting it does.
         lock = "SELECT 1 FROM webhooks WHERE id = %s FOR NO KEY UPDATE"
         if await connection.row(lock, row["webhook_id"]) is None:
             return
@@ -153,7 +153,7 @@ class WebhookSender(ClaimedWork):
         await self._note_health(connection, row["webhook_id"], result)
 
     async def _note_health(self, connection: Connection, webhook_id: str, result: Result) -> None:
-        """Remember since when a receiver only fails; switch it off after days of that, or when it is gone."""
+        """Record since when a receiver only fails; disable it after days of failures, or when it is gone."""
         if result.outcome == "delivered":
             await connection.execute(
                 "UPDATE webhooks SET failing_since = NULL WHERE id = %s AND failing_since IS NOT NULL",
@@ -178,7 +178,7 @@ class WebhookSender(ClaimedWork):
 
 
 def outcome_of(status: int) -> Outcome:
-    """What a status means for a message; redirects are not followed, so they are as final as a refusal."""
+    """The outcome for a status. Redirects are not followed, so they are as final as a refusal."""
     if 200 <= status < 300:
         return "delivered"
     if status == 410:
@@ -187,15 +187,15 @@ def outcome_of(status: int) -> Outcome:
 
 
 def pause(round_: int, first_s: float) -> float:
-    """Seconds after so many failures: four times as long each, up to 12 h, and a little at random.
+    """Pause (s) after ``round_`` failures: growing fourfold up to 12 h, with some jitter.
 
-    Receivers that failed together are not asked again together.
+    So messages that failed together are not retried together.
     """
     return min(first_s * PAUSE_FACTOR ** (round_ - 1), PAUSE_MAX_S) * random.uniform(1 - JITTER, 1 + JITTER)
 
 
 def retry_after(answer: Answer) -> float:
-    """Seconds the receiver asks for, at most 12 h; 0 where it asks for none that can be read."""
+    """The receiver's Retry-After in seconds, at most 12 h; 0 if it is missing or malformed."""
     return min(retry_after_s(answer.headers.get("retry-after")) or 0.0, PAUSE_MAX_S)
 
 

@@ -1,6 +1,6 @@
 """Webhooks as their owners see them: create, change, delete, test, list deliveries, send again.
 
-Triggers of the schema put messages into the outbox, in the transaction of the change that they report;
+Triggers of the schema put messages into the outbox in the transaction of the reported change;
 `workers.webhooks.webhook_sender` sends them.
 """
 
@@ -91,7 +91,7 @@ class WebhookStore(OwnedStore):
         description: str | None = None,
         enabled: bool | None = None,
     ) -> WebhookView:
-        """Change what is given. Switching on (again) forgets that it failed; switching off drops what waits.
+        """Change the given fields. Enabling it clears its failures; disabling it drops waiting messages.
 
         Raises `NotFound`, `InputError` (``webhook_url_refused``).
         """
@@ -111,7 +111,7 @@ class WebhookStore(OwnedStore):
             return _webhook(row)
 
     async def rotate(self, webhook_id: str) -> tuple[WebhookView, str]:
-        """A new secret; for a day messages carry signatures of both. Raises `NotFound`."""
+        """A new secret; for a day, messages are signed with both. Raises `NotFound`."""
         secret = new_secret()
         async with self._database.transaction() as connection:
             await self._required(connection, webhook_id, lock=True)
@@ -123,7 +123,7 @@ class WebhookStore(OwnedStore):
             return _webhook(row), secret
 
     async def delete(self, webhook_id: str) -> None:
-        """Delete it with its deliveries; what waits is not sent. Raises `NotFound`."""
+        """Delete it with its deliveries; waiting messages are not sent. Raises `NotFound`."""
         sql = f"DELETE FROM webhooks WHERE id = %s AND {_MINE} RETURNING id"
         async with self._database.transaction() as connection:
             await connection.required_row(f"No webhook {webhook_id}.", sql, webhook_id, self._tenant)
@@ -159,7 +159,7 @@ class WebhookStore(OwnedStore):
     async def deliveries(
         self, webhook_id: str, *, limit: int = 50, cursor: str | None = None
     ) -> Page[DeliveryView]:
-        """What was sent or is to be, newest first; raises `NotFound`, `InputError` (``bad_cursor``)."""
+        """Messages sent and waiting, newest first; raises `NotFound`, `InputError` (``bad_cursor``)."""
         place = newest_first(cursor, limit)
         async with self._database.transaction() as connection:
             await self._required(connection, webhook_id)
@@ -174,9 +174,9 @@ class WebhookStore(OwnedStore):
             return await _delivery(connection, webhook_id, delivery_id)
 
     async def redeliver(self, webhook_id: str, delivery_id: str) -> DeliveryView:
-        """Send a message again, under the id it had, at once and with a fresh count of attempts.
+        """Send a message again at once, with the same id and a fresh count of attempts.
 
-        One that waits already comes at once; one under way comes twice.
+        A waiting one is sent at once; one that is being sent arrives twice.
         Raises `NotFound`, `Conflict` (``state_conflict``).
         """
         async with self._database.transaction() as connection:
@@ -213,7 +213,7 @@ async def add_webhook(
     job_id: str | None = None,
     batch_id: str | None = None,
 ) -> None:
-    """The webhook of one job or batch, in the transaction that makes it and before its first event.
+    """Create the webhook of one job or batch, in the transaction that creates that and before its first event.
 
     Raises `InputError` (``webhook_url_refused``).
     """
@@ -226,7 +226,7 @@ async def add_webhook(
 
 
 async def drop_pending(connection: Connection, webhook_id: str) -> None:
-    """What waits for a webhook that was switched off is not going to be sent."""
+    """Mark the waiting messages of a disabled webhook as failed."""
     await connection.execute(
         "UPDATE webhook_deliveries SET state = 'failed', finished_at = clock_timestamp()"
         " WHERE webhook_id = %s AND state = 'pending'",
