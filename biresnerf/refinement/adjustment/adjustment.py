@@ -31,7 +31,7 @@ from biresnerf.refinement.numbers.finish import EvidenceNumbers
 
 @dataclass(frozen=True, eq=False)
 class Halves:
-    """Whether patches know what they say: two halves of them, adjusted to on their own.
+    """A check of the patches: the results of adjusting to two halves of them separately.
 
     Attributes:
         middle: cameras between the two results.
@@ -82,17 +82,17 @@ class Adjustment:
 
     @property
     def known_noise_px(self) -> float:
-        """That of the tracks, to judge other poses by; one where it was not measured."""
+        """The noise of the tracks, to judge other poses by; one where it was not measured."""
         return self.track_noise_px if np.isfinite(self.track_noise_px) else 1.0
 
 
 def adjust_poses(
     world_from_cam: Array, evidence: Evidence, prior: PosePrior, halves: Halves | None = None
 ) -> Adjustment:
-    """Adjust poses [n, 4, 4] to evidence, from where they are, and its lenses as far as it tells of them.
+    """Adjust poses [n, 4, 4] to evidence, starting from them, and its lenses as far as it determines them.
 
-    Never raises on poor evidence: where it fixes nothing, poses and lenses stay. Patches whose halves disagree have no
-    say.
+    Never raises on poor evidence: where it fixes nothing, poses and lenses stay. Patches whose halves disagree are
+    ignored.
 
     Args:
         halves: of the same patches from the same poses and lenses, where they are known.
@@ -116,7 +116,7 @@ def adjust_poses(
 def _adjusted(
     world_from_cam: Array, evidence: Evidence, prior: PosePrior, halves: Halves | None
 ) -> Adjustment:
-    """With the lenses' parameters free that may move, whether the evidence tells of them or not."""
+    """Adjust with all lens parameters free that may move, whether or not the evidence determines them."""
     lenses = evidence.lenses
     cameras, before = Cameras.of(world_from_cam, lenses), Prior.of(prior, lenses)
     if halves is None and evidence.patches is not None and len(evidence.patches) > 1:
@@ -146,7 +146,7 @@ def _adjusted(
 def _halves(cameras: Cameras, evidence: Evidence, prior: Prior) -> Halves:
     """Adjust to two halves of the patches, each on its own, if enough of them fit the coarsest scale from the start.
 
-    The noise level is what makes the covariance of the difference as large as the difference is.
+    The noise level is chosen so that the covariance of their difference matches the difference.
     """
     assert evidence.patches is not None
     numbers, even = evidence.numbers, np.arange(len(evidence.patches)) % 2 == 0
@@ -191,7 +191,7 @@ def misfit(world_from_cam: Array, evidence: Evidence, noise_px: float) -> Array:
     """How badly poses fit evidence that they were not adjusted to: each camera's mean robust square [n].
 
     Points are estimated anew for these poses, as are the depths of patches: poses must be in their frame. A residual e,
-    in noise levels, counts S^2 e^2 / (S^2 + e^2), below `NOTHING_FITS`. NaN for a camera that no evidence is of.
+    in noise levels, counts S^2 e^2 / (S^2 + e^2), below `NOTHING_FITS`. NaN for a camera without evidence.
 
     Args:
         noise_px: standard deviation of either coordinate of an observation at poses without error, as measured by an

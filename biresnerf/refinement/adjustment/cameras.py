@@ -38,7 +38,7 @@ class Cameras:
     Attributes:
         lens: [g, 8], see `biresnerf.refinement.adjustment.lens.lenses`. Without rows all are as in the evidence.
         lens_of: int64 [n], the row of each camera's lens.
-        kinds: int64, which of a lens's parameters are unknown of any.
+        kinds: int64, the lens parameters that are unknown for at least one lens.
     """
 
     rotation: Array
@@ -61,7 +61,7 @@ class Cameras:
 
     @property
     def unknowns(self) -> int:
-        """How long an increment is: 6n + 8g."""
+        """The length of an increment: 6n + 8g."""
         return POSE * len(self) + LENS * len(self.lens)
 
     def world_from_cam(self) -> Array:
@@ -71,7 +71,7 @@ class Cameras:
         return poses
 
     def moved(self, motion: Array) -> Cameras:
-        """After an increment [6n + 8g]: of each camera a rotation vector and a shift, both in the world's axes."""
+        """The cameras after an increment [6n + 8g]: for each a rotation vector and a shift in the world's axes."""
         poses, lenses = self.split(motion)
         turn = rotation_of(poses[:, :3])
         return replace(
@@ -85,7 +85,7 @@ class Cameras:
         return np.concatenate([poses.reshape(-1), (self.lens - other.lens).reshape(-1)])
 
     def same_lenses(self, other: Cameras) -> bool:
-        """Whether lenses and what is unknown of them are the same."""
+        """Whether the lenses and their unknown parameters are the same."""
         return np.array_equal(self.lens, other.lens) and np.array_equal(self.kinds, other.kinds)
 
     def split(self, unknowns: Array) -> tuple[Array, Array]:
@@ -122,7 +122,7 @@ class Cameras:
         return rows
 
     def rays_of(self, image: NDArray[np.int64], rays: Array) -> Array:
-        """Rays [m, ..., 3] with z = 1 of pixels, as these lenses have them, from those of the evidence's lenses."""
+        """Rays [m, ..., 3] with z = 1 of pixels through these lenses, from those through the evidence's lenses."""
         if not len(self.lens):
             return rays
         now = self.lens[self.lens_of[image]].reshape(-1, *(1,) * (rays.ndim - 2), LENS)

@@ -48,7 +48,7 @@ def choose(
     alike: Mapping[str, NDArray[np.bool_]] | None = None,
     first: int = 0,
 ) -> Choice:
-    """The candidate that evidence left out speaks for.
+    """The candidate that left-out evidence supports.
 
     A candidate is beaten by one that fits some kind of evidence better and none worse, beyond chance over cameras. The
     first is kept unless something beats it: then the first one that beats it, and that nothing beats, is taken.
@@ -57,7 +57,7 @@ def choose(
         candidates: in the order in which they are kept on a tie.
         misfits: of each kind of evidence (``tracks``, ``patches``), [candidates, n]: each camera's mean robust square
             in noise levels; NaN where it does not know the camera.
-        alike: bool [candidates] by kind: candidates that such evidence does not tell from each other, whatever it fits.
+        alike: bool [candidates] by kind: candidates that such evidence cannot distinguish, whatever it fits.
         first: index of the candidate that is kept on a tie.
     """
     reports = tuple(
@@ -93,7 +93,7 @@ def _beats(
 
 
 def judged(before: Array, after: Array) -> Finding:
-    """What misfits [n] of one set of poses and another say of the latter, by the cameras that are known with both."""
+    """What misfits [n] of one set of poses and another say about the latter, by the cameras known in both."""
     known = np.isfinite(before) & np.isfinite(after)
     return compare(octaves(before[known], after[known], _LEAST) / 2, LEFT_OUT).finding
 

@@ -99,7 +99,7 @@ class Positions:
     Attributes:
         image: int64 [m].
         metres, deviation: [m, 3], and standard deviations along the axes, m.
-        stated: whether these are known; otherwise they are one, and the residuals tell.
+        stated: whether these are known; otherwise they are one, and the residuals give the scale.
     """
 
     image: NDArray[np.int64]
@@ -109,7 +109,7 @@ class Positions:
 
     @classmethod
     def of(cls, image: NDArray[np.int64], metres: Array, accuracy: Array) -> Positions:
-        """From accuracies [m, 3], NaN where they are not known: where most are, those positions alone are used."""
+        """From accuracies [m, 3], NaN where they are not known: if most are known, only those positions are used."""
         known = np.asarray(np.isfinite(accuracy).all(1))
         if 2 * known.sum() < len(known):
             return cls(image, metres, np.ones_like(metres), stated=False)
@@ -131,7 +131,7 @@ class Control:
 
     @classmethod
     def of(cls, tracks: Tracks, metres: Array, accuracy: Array) -> Control:
-        """From accuracies [p, 3], NaN where they are not known: the points' marks then tell how exact they are."""
+        """From accuracies [p, 3], NaN where they are not known: the points' marks then give the accuracy."""
         exact = EXACT * rms_spread(metres)
         return cls(tracks, metres, np.where(np.isfinite(accuracy), np.maximum(accuracy, exact), exact))
 
@@ -147,7 +147,7 @@ class Evidence:
         patches: None where there are none.
         lenses: how the lenses differ from the intrinsics, and how well that is known; None: not at all.
         positions, control: None where none are measured, or they tell nothing.
-        numbers: what it is worth.
+        numbers: how the evidence is weighted, and when it is believed.
     """
 
     intrinsics: Intrinsics
@@ -160,7 +160,7 @@ class Evidence:
 
     @property
     def held_by_measurements(self) -> NDArray[np.int64]:
-        """Images whose place in the rig measured places hold: with control points, all that tracks tie."""
+        """Images whose place in the rig is fixed by measured places: with control points, all that tracks tie."""
         held = [] if self.positions is None else [self.positions.image]
         held += [self.tracks.image] if self.control is not None and self.tracks is not None else []
         return np.unique(np.concatenate([np.zeros(0, np.int64), *held]))
@@ -172,7 +172,7 @@ class Evidence:
 
 @dataclass(frozen=True, eq=False)
 class PosePrior:
-    """Poses that are known before, with the standard deviations of their errors.
+    """Poses known a priori, with the standard deviations of their errors.
 
     Attributes:
         world_from_cam: [n, 4, 4].

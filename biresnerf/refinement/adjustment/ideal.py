@@ -26,7 +26,7 @@ def ideal_cameras(intrinsics: Intrinsics) -> Intrinsics:
 
 
 def resized(intrinsics: Intrinsics, widths: NDArray[np.int64], heights: NDArray[np.int64]) -> Intrinsics:
-    """Of the same pictures resampled to other sizes (px) [n]."""
+    """The intrinsics of the same pictures resampled to other sizes (px) [n]."""
     width, height = torch.from_numpy(widths.astype(np.int64)), torch.from_numpy(heights.astype(np.int64))
     x, y = width / intrinsics.width, height / intrinsics.height
     i = intrinsics

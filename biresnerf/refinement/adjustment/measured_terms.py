@@ -1,4 +1,4 @@
-"""Places that were measured as terms of the adjustment, in a frame of their own: of cameras, and of control points."""
+"""Measured places of cameras and of control points as terms of the adjustment, in a separate frame."""
 
 from __future__ import annotations
 
@@ -82,10 +82,10 @@ class PositionTerm:
 
 
 class ControlTerm(TrackTerm):
-    """Reprojections of points that are known to be at measured coordinates, as exactly as these are.
+    """Reprojections of points at measured coordinates, which have errors themselves.
 
     The similarity between both frames is found anew with each measurement of the noise, so that frame and scale stay
-    free; the noise level begins with what the points miss their marks by.
+    free; the noise level starts from the points' distances from their marks.
 
     Attributes:
         far_off: bool [p], points that contradict the photos by what the last measurement found.
@@ -149,7 +149,7 @@ def control_believed(evidence: Evidence, cameras: Cameras) -> bool:
 
 
 def measured_misfits(rigs: Sequence[tuple[Cameras, Evidence]]) -> dict[str, tuple[Array, NDArray[np.bool_]]]:
-    """How badly sets of cameras fit what was measured, and which fit it as well as the best one, beyond chance.
+    """How badly sets of cameras fit what was measured, and which fit it as well as the best one, within chance.
 
     Returns for each kind the robust squares [c, m] in noise levels of the best, and bool [c].
     """

@@ -37,7 +37,7 @@ class Surfaces:
 
 @dataclass(frozen=True, eq=False)
 class _Planes:
-    """The plane that fits the inverse depth around each grid cell best: value and slopes [3, h, w], and if it does."""
+    """Planes that best fit the inverse depth around grid cells: value and slopes [3, h, w], and whether each fits."""
 
     inverse: Array
     usable: NDArray[np.bool_]
@@ -52,7 +52,7 @@ def find_patches(
     numbers: EvidenceNumbers,
     seed: int = 0,
 ) -> Patches | None:
-    """Patches of all photos, at most so many of each, with the photos to compare them with; None of none.
+    """Patches of all photos, at most so many of each, with the photos to compare them with; None if there are none.
 
     Args:
         world_from_cam: [n, 4, 4], the poses that the surfaces are seen from.

@@ -77,7 +77,7 @@ class PatchTerm:
         )
 
     def measure(self, cameras: Cameras) -> float:
-        """Go on to the next finer level; 0 where there is none."""
+        """Go on to the next finer level; returns 0 where there is none, else 1."""
         if not self._levels:
             return 0.0
         blur, self.scale = self._levels.pop(0)
@@ -93,7 +93,7 @@ class PatchTerm:
         return squared
 
     def settle(self, cameras: Cameras) -> None:
-        """The depths' scales that fit best, for cameras that stay."""
+        """Set the depths' scales to those that fit best, with cameras fixed."""
         deviation = self._numbers.scale_deviation
         fixed = *self._expected, self.scale, deviation, 2 * deviation
         self._in_parts(lambda part: settle_scales(*part[1], *fixed), cameras, self.unknowns)
@@ -141,7 +141,7 @@ class PatchTerm:
     def _in_parts(
         self, kernel: Callable[[tuple[slice, Seen]], Result], cameras: Cameras, scales: Array
     ) -> list[Result]:
-        """What a kernel makes of the patches, a part of them on each of the threads."""
+        """Run a kernel on the patches, a part of them on each thread."""
         return in_parts(lambda part: kernel((part, self._seen(cameras, scales, part))), len(self.patches))
 
     def _seen(self, cameras: Cameras, scales: Array, taken: slice) -> Seen:

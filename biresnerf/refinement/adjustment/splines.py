@@ -17,7 +17,7 @@ def spline_coefficients(photo: Floats) -> Floats:
 
 
 def _filtered(values: Floats) -> Floats:
-    """Along the first axis."""
+    """Filter along the first axis."""
     n = len(values)
     if n == 1:
         return values
@@ -34,7 +34,7 @@ def _filtered(values: Floats) -> Floats:
 
 
 def blurred(photo: Floats, sigma_px: float) -> Floats:
-    """A Gaussian over the first two axes, mirrored at the borders."""
+    """Blur by a Gaussian over the first two axes, mirrored at the borders."""
     if sigma_px <= 0:
         return photo
     half = int(np.ceil(REACH * sigma_px))

@@ -1,4 +1,4 @@
-"""Fisheyes for the kernels of pinholes: a view of its own for each observation, straight at what was observed."""
+"""Fisheyes for the pinhole kernels: a separate view for each observation, directed at what was observed."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class TangentViews:
     def looking_at(
         cls, xy: Array, image: NDArray[np.int64], intrinsics: Intrinsics, near: Array, cameras: Cameras
     ) -> TangentViews:
-        """Of observations at `xy` [m, 2] of photos, as the cameras' lenses are now.
+        """The views of observations at `xy` [m, 2] of photos, by the cameras' present lenses.
 
         Args:
             intrinsics: of the evidence.

@@ -89,7 +89,7 @@ class TrackTerm:
         return abs(self.noise_px / before - 1)
 
     def settle(self, cameras: Cameras) -> None:
-        """Points to where they fit best for cameras that stay."""
+        """Move points to where they fit best, with cameras fixed."""
         in_parts(
             lambda part: settle_points(
                 *self._seen(cameras, self.unknowns, part),
@@ -103,9 +103,9 @@ class TrackTerm:
         )
 
     def _measured_noise(self, cameras: Cameras) -> float:
-        """From the median residual; points and cameras have taken their share of the degrees of freedom.
+        """The noise by the median residual, corrected for the degrees of freedom of points and cameras.
 
-        Of points that are seen from places apart: copies of a photo, and photos from a tripod, fit each other exactly.
+        Only points seen from different places count: copies of a photo, and photos from a tripod, fit exactly.
         """
         errors, apart = self.errors_px(cameras), self._seen_from_apart(cameras)
         if apart.any():
@@ -161,7 +161,7 @@ class TrackTerm:
     def _seen(
         self, cameras: Cameras, points: Array, taken: slice | None = None
     ) -> tuple[NDArray[np.generic], ...]:
-        """What all kernels read, of all points [p, 3] or of a part of them."""
+        """The arrays that all kernels read, for all points [p, 3] or a part of them."""
         taken = taken or slice(0, len(points))
         start = self.start[taken.start : taken.stop + 1]
         lens = cameras.lens_rows(self.lens)
@@ -172,7 +172,7 @@ class TrackTerm:
         return rotation, centre, lens, points[taken], start, view, views.xy
 
     def _tangent_views(self, cameras: Cameras) -> TangentViews:
-        """Those of the lenses as they are now; the last ones are kept."""
+        """The tangent views of the present lenses; the last ones are cached."""
         kept = self._views
         if kept is None or not kept[0].same_lenses(cameras):
             near = self.lens[:, 4]

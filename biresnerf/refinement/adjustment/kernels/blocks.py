@@ -1,4 +1,4 @@
-"""Blocks of cameras and lenses that are seen together: which there are, sums of them, and ways along them.
+"""Blocks of cameras and lenses that are seen together: their pattern, their sums, and paths along them.
 
 `begin` and `other` are those of `biresnerf.refinement.adjustment.solver.blocks`.
 """
@@ -71,7 +71,7 @@ def add_block(system, one, two, offsets, block):
 
 @njit(**KERNEL)
 def steps_from(source, begin, other):
-    """Ties on the shortest way from a part to each [count]; -1 where there is none."""
+    """The number of ties on the shortest path from a part to each [count]; -1 where there is none."""
     steps, queue = np.full(len(begin) - 1, -1), np.empty(len(begin) - 1, np.int64)
     steps[source], queue[0], done, waiting = 0, source, 0, 1
     while done < waiting:

@@ -207,7 +207,7 @@ def patch_system(
             its lens, are among all u.
         host_parts, target_parts, offsets: where these are among the system's blocks, see `Cameras`.
 
-    Returns of each patch the inverse of its own entry and its gradient, and the mixed row of its host. Fills that of
+    Returns for each patch the inverse of its own entry and its gradient, and the mixed row of its host. Fills that of
     each target [m, w].
     """
     patches, pixels, channels = len(host), values.shape[1], values.shape[2]

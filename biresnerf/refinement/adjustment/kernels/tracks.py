@@ -211,7 +211,7 @@ def track_system(
         mixed: zero; gets the mixed block [m, 6 + k, 3] of each observation of these points.
 
     Returns for each point the inverse of its own block and its gradient.
-    A point that its observations do not fix in this precision has a zero inverse, and no say.
+    A point that its observations do not fix in this precision has a zero inverse and no effect.
     """
     points, width, kinds = len(xyz), rows.shape[1], offsets[6:]
     inverses, gradients = np.zeros((points, 3, 3)), np.zeros((points, 3))

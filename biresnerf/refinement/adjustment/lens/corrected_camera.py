@@ -44,7 +44,7 @@ def corrected_camera(camera: Camera, correction: Array) -> Camera:
 
 
 def _fitted(lens: FullParameters, camera: Camera, correction: Array) -> FullParameters:
-    """A lens with what it may differ in fitted to the corrected camera, over the whole image.
+    """A lens whose free parameters are fitted to the corrected camera over the whole image.
 
     In f, f k1, f k2, f p1, f p2 and the principal point everything is linear, if y is counted in fx.
     """

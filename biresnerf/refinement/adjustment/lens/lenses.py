@@ -61,7 +61,7 @@ class LensEstimate:
     Attributes:
         correction: [g, 8], of the evidence's lenses.
         deviation: [g, 8], standard deviation as prior and evidence give it; NaN where nothing was to be found.
-        observable: [g, 8], whether the evidence tells. Where it does not, the parameter is as it was.
+        observable: [g, 8], whether the evidence determines it. If not, the parameter stays as it was.
     """
 
     correction: Array

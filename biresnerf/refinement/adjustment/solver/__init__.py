@@ -1,1 +1,1 @@
-"""Levenberg-Marquardt over all cameras: what evidence offers it, how cameras may move, how exactly they are known."""
+"""Levenberg-Marquardt over all cameras: the interface of evidence, how cameras may move, and their covariance."""

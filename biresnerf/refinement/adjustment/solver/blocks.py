@@ -1,4 +1,4 @@
-"""Symmetric matrices over cameras and lenses: blocks of those that evidence ties, and nothing of the others."""
+"""Symmetric matrices over cameras and lenses: only blocks of those that evidence ties are stored."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Blocks:
 
     @classmethod
     def of_cameras(cls, cameras: Cameras, image: NDArray[np.int64], own: Array) -> Blocks:
-        """Of some cameras [m] alone, [m, 6, 6] each."""
+        """A matrix of some cameras [m] alone, [m, 6, 6] each."""
         found = cls.nothing(cameras)
         np.add.at(found.values[:, :POSE, :POSE], image, own)
         return found
@@ -81,7 +81,7 @@ class Blocks:
 
     @property
     def rows(self) -> NDArray[np.int64]:
-        """Of each block the part of its rows [b]."""
+        """The part [b] of each block's rows."""
         return np.repeat(np.arange(self.parts), np.diff(self.begin))
 
     @property
@@ -110,17 +110,17 @@ class Blocks:
 
     @property
     def diagonal(self) -> Array:
-        """[6n + 8g]."""
+        """The diagonal [6n + 8g]."""
         return self.in_a_row(np.diagonal(self.values[self.begin[:-1]], axis1=1, axis2=2))
 
     def with_diagonal(self, more: Array) -> Blocks:
-        """With numbers [6n + 8g] added to the diagonal."""
+        """The matrix with numbers [6n + 8g] added to the diagonal."""
         values = self.values.copy()
         values[self.begin[:-1]] += self.by_part(more)[:, :, None] * np.eye(values.shape[1])
         return replace(self, values=values)
 
     def scaled(self, unit: Array) -> Blocks:
-        """Rows and columns times numbers [6n + 8g]."""
+        """The matrix with rows and columns multiplied by numbers [6n + 8g]."""
         by = self.by_part(unit)
         return replace(self, values=self.values * by[self.rows][:, :, None] * by[self.other][:, None, :])
 
@@ -133,12 +133,12 @@ class Blocks:
         return found
 
     def in_a_row(self, by_part: Array) -> Array:
-        """The way back from `by_part`."""
+        """The inverse of `by_part`."""
         poses, lenses = by_part[: self.cameras, :POSE], by_part[self.cameras :]
         return np.concatenate([each.reshape(-1, *by_part.shape[2:]) for each in (poses, lenses)])
 
     def dense(self) -> Array:
-        """[6n + 8g, 6n + 8g]."""
+        """The full matrix [6n + 8g, 6n + 8g]."""
         width = self.values.shape[1]
         whole = np.zeros((self.parts, width, self.parts, width))
         whole[self.other, :, self.rows] = self.values.transpose(0, 2, 1)

@@ -51,7 +51,7 @@ class BodyMoves:
         return found
 
     def of_bodies(self, forces: Array) -> Array:
-        """Of forces on cameras [n, 6, ...], those on bodies [m, 6, ...]."""
+        """Forces on bodies [m, 6, ...], from those on cameras [n, 6, ...]."""
         found = np.zeros((self.bodies, *forces.shape[1:]))
         moving = self.of >= 0
         np.add.at(found, self.of[moving], np.einsum("nab,na...->nb...", self.columns[moving], forces[moving]))
@@ -95,7 +95,7 @@ def rigid_motion(cameras: Cameras, bodies: RigidBodies, motion: Array) -> Array:
 
 
 def _middles(cameras: Cameras, bodies: RigidBodies) -> Array:
-    """Of each camera's body [n, 3]."""
+    """The middle of each camera's body [n, 3]."""
     count = np.bincount(bodies.of)
     sums = np.stack([np.bincount(bodies.of, cameras.centre[:, a]) for a in range(3)], 1)
     return np.asarray((sums / count[:, None])[bodies.of])

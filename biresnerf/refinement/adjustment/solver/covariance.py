@@ -37,8 +37,8 @@ def covariance(
         information: N, the normal equations of cameras and lenses without damping.
         lenses: which of the 8g unknowns of lenses may move; none where None.
         aligned: the cameras [n] whose centres count in the alignment; all where None.
-        bodies: cameras that are fixed or move as one. The alignment is by what they leave of turning, moving and
-            scaling: nothing where two cameras are fixed, no scale where a body has several centres.
+        bodies: cameras that are fixed or move as one. The alignment uses the rotation, shift and scale that they leave
+            free: none where two cameras are fixed, no scale where a body has several centres.
     """
     spread = float(np.sqrt(((cameras.centre - cameras.centre.mean(0)) ** 2).sum(1).mean())) or 1.0
     # Positions count in spreads of the rig.
@@ -66,7 +66,7 @@ def covariance(
 
 
 def _inverses(information: Blocks, common: Array, lenses: NDArray[np.bool_]) -> Array:
-    """Of each camera [n, 6, 6], where errors have no part along common motions [6n, m]; NaN where there are none."""
+    """Each camera's covariance [n, 6, 6], of errors with no part along common motions [6n, m]; NaN where unknown."""
     poses, none = POSE * information.cameras, np.zeros(len(lenses))
     known = information.with_diagonal(np.concatenate([np.full(poses, 1 / NOTHING_KNOWN**2), none]))
     held = common * float(known.diagonal[:poses].mean())  # as large as the rest: only their directions count
@@ -78,7 +78,7 @@ def _inverses(information: Blocks, common: Array, lenses: NDArray[np.bool_]) -> 
 
 
 def common_motions(cameras: Cameras, counted: NDArray[np.bool_]) -> Array:
-    """What turns, moves and scales all cameras [6n, 7], about the middle of some."""
+    """Increments [6n, 7] that turn, move and scale all cameras about the middle of some."""
     n = len(cameras)
     away = cameras.centre - (cameras.centre[counted].mean(0) if counted.any() else 0.0)
     motions = np.zeros((n, 6, 7))

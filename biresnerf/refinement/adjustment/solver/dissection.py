@@ -41,7 +41,7 @@ class Front:
 
 
 def fronts_of(matrix: Blocks) -> tuple[Front, ...]:
-    """In order; the last one holds the separator of the largest group of parts, and what is tied to most of them."""
+    """The fronts in order; the last has the separator of the largest group of parts, and what most are tied to."""
     return _fronts(matrix.parts, matrix.begin.tobytes(), matrix.other.tobytes())
 
 
@@ -105,7 +105,7 @@ def _dissect(
 
 
 def _sides(parts: Parts, count: int, pairs: tuple[Parts, Parts]) -> tuple[Parts, Parts, Parts] | None:
-    """Two sides that nothing ties, and what is between them; None where that is most of the parts.
+    """Two sides with no ties between them, and their separator; None where that is most of the parts.
 
     Parts are ordered by how much nearer they are, in ties, to one end than to the other.
     """

@@ -139,7 +139,7 @@ def _free_unknowns(parts: NDArray[np.int64], width: int, free: NDArray[np.bool_]
 
 
 def _entries(matrix: Blocks, front: Front, free: NDArray[np.bool_]) -> Array:
-    """What the matrix itself has of a front's free unknowns, its own first."""
+    """The entries of the matrix for a front's free unknowns, its own first."""
     width, parts = matrix.values.shape[1], np.concatenate([front.own, front.around])
     whole = np.zeros((len(parts), width, len(parts), width))
     values = matrix.values[front.blocks]

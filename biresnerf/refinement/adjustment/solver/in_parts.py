@@ -15,7 +15,7 @@ Result = TypeVar("Result")
 
 
 def in_parts(kernel: Callable[[slice], Result], items: int) -> list[Result]:
-    """What a kernel that releases Python's lock makes of as many equal parts of the items, in order."""
+    """The results of a kernel that releases Python's lock, run on equal parts of the items, in order."""
     workers = numba.get_num_threads()
     bounds = np.linspace(0, items, workers + 1).astype(int)
     parts = (slice(*ends) for ends in pairwise(bounds))

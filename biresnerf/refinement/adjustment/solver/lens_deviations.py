@@ -21,7 +21,7 @@ TOLD = 1e-9  # of a lens's own information, in systems that are not dense: what 
 def posterior(cameras: Cameras, information: Blocks, lenses: Lenses) -> Array:
     """Standard deviations [g, 8] of lenses, with poses unknown but for the evidence; NaN of those held.
 
-    The prior of the poses has no part in it: if they err alike, it would pass for knowledge of the lens.
+    The prior of the poses is left out: errors that they share would be mistaken for knowledge of the lens.
 
     Args:
         information: of the evidence alone.
@@ -37,10 +37,9 @@ def posterior(cameras: Cameras, information: Blocks, lenses: Lenses) -> Array:
 
 
 def _by_blocks(cameras: Cameras, information: Blocks, free: NDArray[np.bool_], before: Array) -> Array:
-    """Of all lenses [8g], where the motions of the whole rig, that change no evidence, are held.
+    """Deviations of all lenses [8g], with motions of the whole rig held, as these change no evidence.
 
-    A little is known of everything, so that other groups of cameras are regular; lenses that only these have are not
-    told of.
+    A weak prior on all unknowns keeps other groups of cameras regular; lenses of those alone keep their prior.
     """
     own = information.diagonal
     poses = len(own) - len(free)
@@ -63,7 +62,7 @@ def _by_blocks(cameras: Cameras, information: Blocks, free: NDArray[np.bool_], b
 
 
 def _dense(information: Array, poses: int, free: NDArray[np.bool_], before: Array) -> Array:
-    """Of those free, from [u, u]."""
+    """Deviations of the free parameters, from information [u, u]."""
     among = information[:poses, :poses]
     mixed, own = information[:poses, poses:][:, free], information[poses:, poses:][np.ix_(free, free)]
     size = np.sqrt(np.maximum(np.diagonal(among), 1e-300))
@@ -74,7 +73,7 @@ def _dense(information: Array, poses: int, free: NDArray[np.bool_], before: Arra
 
 
 def _deviations(own: Array, shared: Array, before: Array) -> Array:
-    """Of the information `own` less `shared`, and of what was known before; what rounding has left of it is nothing."""
+    """Deviations by the information `own` less `shared`, zero up to rounding where nothing is left, and the prior."""
     size = np.sqrt(np.maximum(np.diagonal(own) + np.diagonal(before), 1e-300))
     values, vectors = np.linalg.eigh((own - shared) / size[:, None] / size[None, :])
     evidence = (vectors * np.where(values > ROUNDING, values, 0)) @ vectors.T

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt over cameras and lenses: terms without their own unknowns, and what is known before."""
+"""Levenberg-Marquardt over cameras and lenses: terms with their own unknowns eliminated, and a prior."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Prior:
     """The prior as a quadratic cost of cameras and lenses.
 
     Attributes:
-        mean: the cameras before.
+        mean: the cameras a priori.
         weight: inverse variances [u]; zero where nothing is known.
         free: which of the u = 6n + 8g unknowns may move.
         bodies: of the cameras, with all fixed that cannot move.
@@ -76,7 +76,7 @@ class Prior:
 
 
 def minimise(cameras: Cameras, terms: Sequence[Term], prior: Prior) -> Cameras:
-    """Cameras of the least robust cost that is found from here; the terms' unknowns and noise levels follow."""
+    """The cameras of least robust cost that is found from here; updates the terms' unknowns and noise levels."""
     for round in range(ROUNDS):
         changes = [term.measure(cameras) for term in terms]
         if round > 0 and max(changes, default=0.0) < SETTLED:
@@ -112,7 +112,7 @@ def _step(
     damping: float,
     cost: float,
 ) -> tuple[Cameras, float] | None:
-    """Cameras and cost after a step that lowers it, the terms' unknowns moved along; None where it does not."""
+    """Cameras and cost after a step, with the terms' unknowns moved along; None if it does not lower the cost."""
     motion = newton_step(cameras, linear, prior, damping)
     if motion is None:
         return None
@@ -156,7 +156,7 @@ def _damped(system: Blocks, right: Array, free: NDArray[np.bool_], damping: floa
 
 
 def normal_equations(cameras: Cameras, linear: Sequence[Linearised], prior: Prior) -> tuple[Blocks, Array]:
-    """Of cameras and lenses alone: the matrix and half the gradient [u]."""
+    """The matrix and half the gradient [u] of cameras and lenses alone."""
     system, right = linear[0].system, prior.right(cameras) + linear[0].right
     for at in linear[1:]:
         system, right = system + at.system, right + at.right

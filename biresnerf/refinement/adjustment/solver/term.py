@@ -1,4 +1,4 @@
-"""What the solver asks of a kind of evidence."""
+"""The solver's interface to one kind of evidence."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Term(Protocol):
     unknowns: Array
 
     def measure(self, cameras: Cameras) -> float:
-        """Settle the unknowns and set the noise level from the residuals as they are; its relative change."""
+        """Settle the unknowns and set the noise level from the present residuals; returns its relative change."""
 
     def cost(self, cameras: Cameras, unknowns: Array) -> float:
         """The robust cost."""
