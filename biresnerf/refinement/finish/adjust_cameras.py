@@ -1,4 +1,4 @@
-"""All cameras adjusted at once, and moved where left-out evidence says that is better and photos do not object."""
+"""Adjust all cameras at once, and move them where left-out evidence supports that and photos do not object."""
 
 from __future__ import annotations
 
@@ -33,14 +33,13 @@ def adjust_cameras(
     *,
     moves: bool = True,
 ) -> Finish:
-    """Adjust all cameras at once, and move them where left-out evidence says that is better; they are to stay there.
+    """Adjust all cameras at once, and move them where left-out evidence supports that; they are held there.
 
-    Cameras that their own matches contradict are placed by those first. Photos have the last word: nothing is moved
-    where they object, by fields that are trained on them unless patches of them speak for it. Methods of others are
-    left alone.
+    Cameras that their own matches contradict are placed by those first. Photos have the last word: nothing is moved if
+    they object, judged by fields trained on them unless patches of them support the move. Other methods are left alone.
 
     Args:
-        moves: whether cameras may move; if not, what the evidence says is only gathered.
+        moves: whether cameras may move; if not, the evidence is only gathered.
 
     Raises:
         Interrupted: stopped; a continued run adjusts again.

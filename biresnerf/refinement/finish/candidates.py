@@ -38,7 +38,7 @@ def adjust(
     announce: Callable[[], None],
     halves: Halves | None = None,
 ) -> dict[CandidateName, Adjustment]:
-    """Adjusted to tracks, to patches and to both; ``halves`` of the patches where they are known."""
+    """Adjustments to tracks, to patches and to both; ``halves`` of the patches where they are known."""
     found: dict[CandidateName, Adjustment] = {}
 
     def add(name: CandidateName, evidence: Evidence, halves: Halves | None = None) -> Adjustment:
@@ -59,7 +59,7 @@ def adjust(
 def as_candidate(
     name: CandidateName, found: Adjustment, evidence: Evidence, cameras: Sequence[Camera]
 ) -> Candidate | None:
-    """An adjustment as a candidate; None where it is not to be believed, or a corrected camera would be no lens."""
+    """An adjustment as a candidate; None where it is not to be believed, or a corrected camera has no valid lens."""
     if not usable(found):
         return None
     if found.lenses is None or evidence.lenses is None or not found.lenses.correction.any():

@@ -1,4 +1,4 @@
-"""The choice of the poses that a run returns: candidates from all evidence, judged by what none was fitted to."""
+"""The choice of the poses that a run returns: candidates from all evidence, judged by what was left out of it."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def _choice(
     alike: Mapping[str, NDArray[np.bool_]],
     start: InitialPoses,
 ) -> Choice:
-    """As `choose`; but no tie gives the input's poses back where photos chose those of matches to start from."""
+    """As `choose`; but a tie does not return to the input's poses where photos chose those of matches as the start."""
     choice = choose(candidates, misfits, alike, _kept_on_a_tie(candidates, set(misfits), alike))
     names = [candidate.name for candidate in candidates]
     matches_won = "matched" in names and len(start.trials) > 1 and start.mostly_matched
@@ -151,7 +151,7 @@ def _choice(
 def _kept_on_a_tie(
     candidates: Sequence[Candidate], kinds: set[str], alike: Mapping[str, NDArray[np.bool_]]
 ) -> int:
-    """The input's poses; the refined ones where no kind of evidence tells these apart: the verdict will, by photos."""
+    """The input's poses; the refined ones where no evidence distinguishes the two: the verdict will, by photos."""
     names = [candidate.name for candidate in candidates]
     both = [names.index("input"), names.index("refined")] if "input" in names else [0, 0]
     told_apart = any(kind not in alike or not alike[kind][both].all() for kind in kinds)
@@ -165,7 +165,7 @@ def _misfits(
     judging: NDArray[np.bool_],
     announce: Callable[[], None],
 ) -> dict[str, Array]:
-    """Of the judging cameras [candidates, m], to what was left out of each kind of evidence that can tell."""
+    """Misfits of the judging cameras [candidates, m] to the left-out part of each kind of evidence that can tell."""
     found: dict[str, Array] = {}
     for kind, left_out in (
         ("tracks", replace(split.left_out, patches=None)),
@@ -182,7 +182,7 @@ def _misfits(
 def _within(
     candidates: Sequence[Candidate], by_tracks: Adjustment, split: SplitEvidence, bodies: RigidBodies
 ) -> NDArray[np.bool_]:
-    """Candidates [c] that are as near to what tracks prefer as the truth may be.
+    """Candidates [c] that are as near to the poses that tracks prefer as the truth may be.
 
     Tracks that were left out share some errors with those that were adjusted to (of lenses, of features that lie beside
     the surface), and so prefer poses that were fitted to such errors, even to the true ones.
@@ -196,7 +196,7 @@ def _within(
 
 
 def _misfit(candidate: Candidate, evidence: Evidence, noise_px: float) -> Array:
-    """Of its own poses and lenses."""
+    """Misfit of a candidate by its own poses and lenses."""
     return misfit(candidate.world_from_cam, replace(evidence, lenses=candidate.lenses), noise_px)
 
 
@@ -208,10 +208,10 @@ def _as_if_left_out(
     noise_px: float,
     cameras: Sequence[Camera],
 ) -> Array:
-    """Misfits [candidates, m] to tracks, where poses of matches know nothing of the tracks that judge.
+    """Misfits [candidates, m] to tracks, as if poses of matches had not been fitted to the judging tracks.
 
-    COLMAP fitted its model to all tracks, so those left out speak for it. In its place stands what its poses and its
-    simple lens become by the others alone, where that fits worse.
+    COLMAP fitted its model to all tracks, so those left out favour it. It is replaced by its poses and simple lens as
+    adjusted to the others alone, where that fits worse.
     """
     matched = next((each for each in candidates if each.name == "matched"), None)
     if matched is None:
@@ -235,7 +235,7 @@ def _as_if_left_out(
 
 
 def _tells(misfits: Array) -> bool:
-    """Whether evidence [candidates, n] knows half of the cameras, and fits them with the best candidate."""
+    """Whether evidence [candidates, n] covers half of the cameras, and fits them at the best candidate."""
     known = np.isfinite(misfits).all(0)
     if not known.any() or known.mean() < 0.5:
         return False
@@ -243,6 +243,6 @@ def _tells(misfits: Array) -> bool:
 
 
 def _most_noise_px(evidence: Evidence) -> float:
-    """More is no feature's noise: the tracks are wrong."""
+    """The most noise that features have; with more, the tracks are wrong."""
     size = torch.maximum(evidence.intrinsics.width, evidence.intrinsics.height).double().median()
     return max(evidence.numbers.most_noise_px, evidence.numbers.most_noise * float(size))

@@ -1,4 +1,4 @@
-"""How far poses may be from the truth: the covariance of what the evidence prefers, and the way there."""
+"""How far poses may be from the truth: the covariance of the poses that the evidence prefers, and the way to them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NORMAL_90 = 1.2816  # of a normal deviate: one in ten is above it
 
 @dataclass(frozen=True, eq=False)
 class ExpectedErrors:
-    """What the evidence says of the errors of poses: normal deviates about a mean.
+    """The errors of poses by the evidence: normal deviates about a mean.
 
     Increments are of the rotation vector (rad) and position (the poses' unit) that lead to the truth, along the world's
     axes; NaN where the evidence does not say.
@@ -51,9 +51,9 @@ class ExpectedErrors:
 
     @property
     def deviations(self) -> float:
-        """How far the poses are from the preferred ones: the median camera's, in standard deviations of its pose.
+        """The median camera's distance from its preferred pose, in standard deviations.
 
-        Infinite where that of most cameras is not known: the evidence does not say, or they are too far away.
+        Infinite where most are unknown: the evidence does not say, or cameras are too far away.
         """
         deviation = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
         fixed = (deviation == 0).all(1)
@@ -65,7 +65,7 @@ class ExpectedErrors:
         return float(np.sqrt(np.median(squares[told]))) if told.any() else np.inf
 
     def bounds_90(self) -> tuple[Array, Array]:
-        """What nine in ten errors are within: of the rotation (rad) and the position, [n] each."""
+        """Bounds of nine in ten errors, of the rotation (rad) and the position, [n] each."""
         turned, shifted = (
             bound_90(self.moments[:, part, part], self.away[:, part]) for part in (slice(3), slice(3, 6))
         )
@@ -84,7 +84,7 @@ def expected_errors(
     patch_noise: float = 1.0,
     bodies: RigidBodies | None = None,
 ) -> ExpectedErrors:
-    """Of poses [n, 4, 4]: the covariance of those that the evidence prefers [n, 4, 4], and the way there.
+    """Errors of poses [n, 4, 4]: the covariance of those that the evidence prefers [n, 4, 4], and the way to them.
 
     Args:
         evidence: in the frame of the preferred poses, which were adjusted to it; its lenses as found, with what was
@@ -132,7 +132,7 @@ def expected_errors(
 
 
 def _turn(b_from_a: Similarity) -> Array:
-    """Increments [6] of poses in a to those in b, [6, 6]."""
+    """The matrix [6, 6] from increments of poses in a to those in b."""
     turn = np.zeros((6, 6))
     turn[:3, :3], turn[3:, 3:] = b_from_a.rotation, b_from_a.scale * b_from_a.rotation
     return turn
@@ -141,8 +141,8 @@ def _turn(b_from_a: Similarity) -> Array:
 def bound_90(moments: Array, away: Array) -> Array:
     """Lengths [n] that one in ten errors exceeds: of normal deviates with mean `away` [n, 3], mean squares [n, 3, 3].
 
-    Their squared length is taken for a chi square of as many degrees of freedom as its mean and variance give
-    (Satterthwaite 1946), and that for the cube of a normal deviate (Wilson and Hilferty 1931).
+    Their squared length is approximated by a chi square with the degrees of freedom that its mean and variance give
+    (Satterthwaite 1946), and that by the cube of a normal deviate (Wilson and Hilferty 1931).
     """
     mean = np.trace(moments, axis1=1, axis2=2)
     # The variance is 2 tr C^2 + 4 d^T C d with C = M - d d^T.

@@ -1,4 +1,4 @@
-"""The evidence of a run that all cameras are adjusted to, and what of it is left out to judge by."""
+"""The evidence of a run that all cameras are adjusted to, and the part left out to judge by."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ class SplitEvidence:
 
     Attributes:
         fitted, left_out: what candidates are adjusted to, and what they are judged by.
-        tracks: those of both parts, and those that were too many; what is returned is adjusted to them.
-        placed: bool [n], cameras that are not at a guess still; the evidence is of their photos alone.
+        tracks: those of both parts and the surplus; the returned poses are adjusted to them.
+        placed: bool [n], cameras no longer at a guessed pose; the evidence is of their photos alone.
     """
 
     fitted: Evidence
@@ -96,16 +96,16 @@ def without_patches(
 
 
 def _intrinsics(dataset: Dataset) -> Intrinsics:
-    """Of each image."""
+    """The intrinsics of each image."""
     return Intrinsics.from_cameras([dataset.camera_of(i) for i in range(len(dataset))])
 
 
 def measured_evidence(
     dataset: Dataset, poses: Array, placed: NDArray[np.bool_], numbers: EvidenceNumbers
 ) -> Evidence:
-    """The measured places of a set, where they tell a frame of placed cameras [n] at these poses [n, 4, 4].
+    """The measured places of a set, where they fix a frame of placed cameras [n] at these poses [n, 4, 4].
 
-    Not positions that are far beyond the others, nor check points.
+    Without positions far beyond the others, and without check points.
     """
     intrinsics = _intrinsics(dataset)
     evidence = Evidence(ideal_cameras(intrinsics), numbers=numbers)

@@ -32,7 +32,7 @@ class GivenPoses:
 
     Attributes:
         world_from_cam: [n, 4, 4], carried into the frame of the others, and from the tracked body to the camera.
-        offset: what all poses of the input lack; None where the errors show none.
+        offset: the offset that all poses of the input share; None where the errors show none.
         rotation, position: standard deviation of each component of the errors: rad, and the unit of `world_from_cam`.
         unit: that unit, in the input's.
         weight: of each camera [n], 0 to 1; 0 where it had no pose, or one far off.
@@ -49,7 +49,7 @@ class GivenPoses:
 
     @property
     def deviations(self) -> tuple[float, float]:
-        """Of rotation and position in a prior: as stated, or else as measured and shared."""
+        """Deviations of rotation and position for a prior: as stated, or else as measured and shared."""
         rotation, position = self.stated
         return rotation or SHARED_ERRORS * self.rotation, position or SHARED_ERRORS * self.position
 
@@ -73,13 +73,13 @@ class GivenPoses:
         )
 
     def tells(self, prior: PosePrior) -> bool:
-        """Whether these poses are known better than some camera is before."""
+        """Whether these poses are more accurate than the prior of some camera."""
         rotation, position = self.stated[0] or self.rotation, self.stated[1] or self.position
         better = rotation < prior.rotation.max() or position < prior.position.max()
         return bool(better and self.weight.any())
 
     def prior(self, other: PosePrior) -> PosePrior:
-        """What these poses and another prior say together."""
+        """The combination of these poses with another prior."""
         mine = self.weight[:, None] / np.array(self.deviations) ** 2
         theirs = 1 / np.stack([other.rotation, other.position], 1) ** 2
         share = (mine / (mine + theirs)).repeat(3, axis=1)
@@ -93,7 +93,7 @@ class GivenPoses:
 def given_poses(given: Array, fitted: Array, known: NDArray[np.bool_]) -> GivenPoses | None:
     """How accurate the input's poses are, from poses of the same cameras that other evidence gave.
 
-    The errors of both are in what is found, so that the input never looks better than it is. Its frame, its scale and
+    The errors found include those of both, so that the input never looks better than it is. Its frame, its scale and
     an offset between tracked body and camera are estimated with it: see `tie`.
 
     Args:
@@ -122,11 +122,11 @@ def given_poses(given: Array, fitted: Array, known: NDArray[np.bool_]) -> GivenP
 def input_accuracy(
     dataset: Dataset, adjusted: Adjustment | None, evidence: Evidence, options: ResolvedOptions
 ) -> GivenPoses | None:
-    """Of poses that the user gave: those of feature matches are of the same evidence, and guesses of none.
+    """The accuracy of poses that the user gave: those of matches share the evidence, and guesses have none.
 
-    What `options` state of it holds in place of what is measured.
+    What `options` state replaces what is measured.
 
-    None where nothing tells, or too few cameras are known.
+    None where no evidence exists, or too few cameras are known.
     """
     if adjusted is None:
         return None

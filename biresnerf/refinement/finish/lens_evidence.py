@@ -1,4 +1,4 @@
-"""What is known of a set's lenses before all cameras are adjusted, and what is made of the answer."""
+"""What is known of a set's lenses before all cameras are adjusted, and what follows from the adjustment."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ OF_MODELS = {K1: "k1", K2: "k2", 5: "p1", 6: "p2", ASPECT: "fy"}
 
 
 def lenses_before(dataset: Dataset, option: RefineIntrinsics, numbers: EvidenceNumbers) -> Lenses:
-    """What may move of the lenses, and how well it is known: all that was not given, or as the option asks.
+    """The lens parameters that may move, and how well they are known: all not given, or as the option says.
 
     A lens that was given keeps its model; one that was not may get any.
     """
@@ -58,7 +58,7 @@ def lenses_before(dataset: Dataset, option: RefineIntrinsics, numbers: EvidenceN
 
 
 def given_focals(dataset: Dataset, option: RefineIntrinsics, numbers: EvidenceNumbers) -> Lenses:
-    """The focal lengths that are to stay as they were given, as if they might move."""
+    """Lenses in which only those focal lengths may move that are otherwise kept as given."""
     given = [dataset.source_of_intrinsics(i) == "given" for i in range(len(dataset.cameras))]
     deviation = np.zeros((len(given), LENS))
     deviation[given if option == "auto" else [], 0] = numbers.focal_deviation("given")
@@ -71,7 +71,7 @@ def _lenses(dataset: Dataset, deviation: Array) -> Lenses:
 
 
 def corrected_cameras(cameras: Sequence[Camera], correction: Array) -> tuple[Camera, ...] | None:
-    """Cameras after corrections [g, 8]; None where one would be no lens."""
+    """Cameras after corrections [g, 8]; None where one would be no valid lens."""
     found = tuple(corrected_camera(c, row) for c, row in zip(cameras, correction, strict=True))
     problems = (lens_problem(camera.full(), camera.width, camera.height) for camera in found)
     return None if any(problem is not None for problem in problems) else found
@@ -83,7 +83,7 @@ def focal_certainty(
     """What an adjustment to the evidence says of each camera's focal length; None where it is not to move.
 
     Args:
-        contradicted: what is said of those that are not to move.
+        contradicted: the result for those that are not to move.
     """
     if found is None or found.lenses is None or evidence.lenses is None:
         return tuple(contradicted)
@@ -103,7 +103,7 @@ def contradicted_focals(
     kept: Lenses,
     by_tracks: Adjustment | None,
 ) -> list[FocalCertainty | None]:
-    """What tracks say of focal lengths that are `kept` as they were given, by letting them go; None of the others.
+    """What tracks say about focal lengths that are `kept` as given, by freeing them; None for the others.
 
     They are contradicted where tracks that were left out agree.
 

@@ -35,8 +35,8 @@ def supported_lenses(
 
     All start with a focal length and the first radial coefficient, where their cameras' models have it. Then the
     principal point is freed, the radial coefficients, tangential ones and the ratio of focal lengths, one after
-    the other. Each stays free where tracks tell its value and that this is not the simpler lens's, and where tracks
-    that were left out fit better.
+    the other. Each stays free where tracks determine its value and show that it differs from the simpler lens's, and
+    where left-out tracks fit better.
     """
     lenses = fitted.lenses
     if lenses is None:
@@ -71,7 +71,7 @@ def simple_lenses(lenses: Lenses, cameras: Sequence[Camera]) -> Lenses:
 
 
 def _told(best: Adjustment, fitted: Evidence, prior: PosePrior, kept: Lenses) -> NDArray[np.bool_]:
-    """Lenses [g] with more free than is `kept` that tracks tell, and by one step would move far beyond its error."""
+    """Lenses [g] with a parameter free beyond `kept` that tracks determine, and one step moves far beyond its error."""
     lenses = fitted.lenses
     assert lenses is not None
     if not best.used or best.lenses is None:

@@ -1,4 +1,4 @@
-"""What came of the adjustment of all cameras."""
+"""The results of the adjustment of all cameras."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Finish:
 
     @property
     def moved(self) -> bool:
-        """Whether other poses than those that were are better."""
+        """Whether other poses are better than those before."""
         return any(each.chosen and each.name != "refined" for each in self.candidates)
 
     @property
@@ -60,7 +60,7 @@ class Finish:
     def errors_of(
         self, world_from_cam: Array, world_from_unit: Similarity, bodies: RigidBodies
     ) -> ExpectedErrors | None:
-        """What the evidence says of the errors of poses [n, 4, 4] in the input's frame, in that frame; or None."""
+        """The expected errors of poses [n, 4, 4] in the input's frame, in that frame; or None."""
         fit = self.fit
         if fit is None or not np.isfinite(world_from_cam).all():
             return None
@@ -69,18 +69,18 @@ class Finish:
         return found.carried(world_from_unit)
 
     def refused(self) -> Finish:
-        """The same where the chosen poses are not taken, and the evidence that prefers them is not believed."""
+        """The result if the chosen poses are rejected, and the evidence that prefers them is not believed."""
         kept = (each.model_copy(update={"chosen": each.name == "refined"}) for each in self.candidates)
         return Finish(tuple(kept))
 
 
 def most_heeded(results: Mapping[CandidateName, Adjustment]) -> Adjustment | None:
-    """The adjustment to most kinds of evidence that is to be believed."""
+    """The credible adjustment that uses most kinds of evidence."""
     return next((results[name] for name in ORDER if name in results and usable(results[name])), None)
 
 
 def heeded(name: CandidateName, found: Adjustment, evidence: Evidence) -> Evidence:
-    """What of the evidence an adjustment was to, with the lenses that it found."""
+    """The part of the evidence that an adjustment used, with the lenses that it found."""
     lenses = evidence.lenses
     if lenses is not None and found.lenses is not None:
         lenses = replace(lenses, correction=found.lenses.correction)
@@ -94,7 +94,7 @@ def fit_of(
     results: Mapping[CandidateName, Adjustment],
     evidence: Mapping[CandidateName, Evidence],
 ) -> Fit | None:
-    """The adjusted poses that heed most, and what each was adjusted to; None where none was to be believed."""
+    """The credible adjusted poses that use most evidence, and that evidence; None where none was credible."""
     name = next((each.name for each in candidates if each.name in results), None)
     if name is None:
         return None

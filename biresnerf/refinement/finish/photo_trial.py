@@ -1,4 +1,4 @@
-"""What photos say of poses that cameras were adjusted to."""
+"""Whether photos support the poses that cameras were adjusted to."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def photos_will_be_asked(scene: Scene, present: NDArray[np.float64], unseen_px: 
     """Whether photos will have to judge the adjusted cameras, as far as the present poses tell.
 
     Cameras that are adjusted to tracks end near those that matches placed: where the present ones are as near, photos
-    do not tell them apart. Unknown is yes.
+    do not distinguish them. True if unknown.
     """
     matched = scene.start.matched_poses
     if matched is None or not (np.isfinite(matched).all() and np.isfinite(present).all()):
@@ -35,8 +35,8 @@ def photos_will_be_asked(scene: Scene, present: NDArray[np.float64], unseen_px: 
 def photos_object(scene: Scene, joint: JointParameters, recipe: Recipe, run: RunState, other: Rig) -> bool:
     """Whether fields trained at other poses predict unseen views less well than at the present ones.
 
-    The feature matches of a symmetric thing may agree on poses that are wrong. SSIM has no say: small photos like poses
-    that were fitted to them better than true ones. Nothing is trained where the poses are too near for photos to tell.
+    The feature matches of a symmetric thing may agree on poses that are wrong. SSIM is ignored: on small photos it
+    prefers poses fitted to them over true ones. Nothing is trained where the poses are too near for photos to tell.
 
     Raises:
         Interrupted: stopped.

@@ -16,12 +16,12 @@ AFTER: tuple[Phase, ...] = ("adjusting", "evaluating", "judging")  # phases that
 
 
 def run_rounds(stages: TwoStages, scene: Scene) -> Finish:
-    """Steps of stage 2, twice with the adjustment of all cameras after them; what came of the last one.
+    """Run stage 2 in two rounds, each followed by the adjustment of all cameras; returns the last result.
 
     Where the first adjustment finds better poses than the field's, they stand still from then on, and the field learns
-    at them for a while. It would only bend them. They are adjusted again only if patches of the photos had no say yet:
-    the surface of a young field may have been too rough for them; and if the run's time allows. A run that was resumed
-    after the first adjustment gathers the evidence once more, and reports what was chosen then.
+    at them for a while. It would only bend them. They are adjusted again only if patches of the photos were not used
+    yet (the surface of a young field may have been too rough for them) and if the run's time allows. A run that was
+    resumed after the first adjustment gathers the evidence once more, and reports what was chosen then.
 
     Raises:
         Interrupted: stopped; a continued run goes on from there.
@@ -60,7 +60,7 @@ def run_rounds(stages: TwoStages, scene: Scene) -> Finish:
 def _time_to_adjust_again(run: RunState, slack_s: float) -> bool:
     """Whether there is time for a second adjustment, as long as the first, and for what follows it.
 
-    The steps were chosen so that there just is: it must not be left out for a moment that they took longer.
+    The number of steps leaves just enough time: a small overrun must not cancel the adjustment.
     """
     after_s = sum(run.monitor.forecast.seconds(phase) for phase in AFTER)
     return after_s < run.left_s + slack_s

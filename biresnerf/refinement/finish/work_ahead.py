@@ -1,4 +1,4 @@
-"""How much work a run has before it, told to its forecast, and as many steps as there is time for."""
+"""How much work is left in a run, reported to its forecast, and how many steps there is time for."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ OVERDRAWN = 1.1  # times the budget: the report warns of more
 
 
 def expect_run(forecast: Forecast, dataset: Dataset, recipe: Recipe) -> None:
-    """All of a run, as far as it is known before its features are."""
+    """Set the forecast to all of a run, as far as known before its features are."""
     options = recipe.options
     few = replace(dataset, frames=dataset.frames[:PHOTOS_LOOKED_AT])
     kind = recipe.method.kinds.of(load_images(few, SMALL, options.background).background is None)
@@ -54,7 +54,7 @@ class WorkAhead:
         self._adjusts = adjusts_cameras(scene.dataset, optimiser.method)
 
     def expect_all(self) -> None:
-        """Tell the forecast all of the run from where its steps begin or go on."""
+        """Set the forecast to all of the run from where its steps begin or continue."""
         optimiser, forecast = self._optimiser, self._run.monitor.forecast
         forecast.leave()
         forecast.continues(sum(self._run.record.seconds.values()))
@@ -63,7 +63,7 @@ class WorkAhead:
         forecast.expect(self.left(), alone=True)
 
     def expect(self) -> None:
-        """Tell it the rest of a run on its way, as its poses and what it has done tell it now."""
+        """Update the forecast with the rest of the run, by its poses and what it has done."""
         self._run.monitor.forecast.expect(self.left())
 
     def left(
@@ -72,7 +72,7 @@ class WorkAhead:
         """What is left after the first step, with other options (of its steps) if given.
 
         Args:
-            checks: what `checks` says, where it was asked already.
+            checks: the result of `checks`, where it is known already.
         """
         schedule, step, switch = self._optimiser.schedule, self._optimiser.step_index, self._optimiser.switch
         options = options or schedule.options
