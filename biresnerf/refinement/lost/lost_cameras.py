@@ -1,7 +1,7 @@
 """Repair of lost cameras: other poses are tried against the frozen field.
 
 A camera that starts too far off ends in a local minimum, or sees nothing and gets no gradient at all. The error
-over its pose has many minima, but the field that the other cameras have formed tells them apart: many poses are
+over its pose has many minima, but the field that the other cameras have formed distinguishes them: many poses are
 scored, the best optimised for some steps, and the winner kept if it is clearly better.
 """
 
@@ -60,7 +60,7 @@ class LostCameraRepair:
         self._spent = 0.0  # samples
 
     def due(self) -> bool:
-        """Whether one of the fixed points has been reached. The switch runs a repair without asking."""
+        """Whether one of the fixed points has been reached. The switch runs a repair regardless."""
         optimiser, options = self.optimiser, self.optimiser.options
         if not optimiser.method.repair:
             return False
@@ -128,7 +128,7 @@ class LostCameraRepair:
 
     @torch.no_grad()
     def _alone(self) -> Tensor:
-        """Mask [n] of training cameras that look where almost no other does: their error cannot show it."""
+        """Mask [n] of training cameras that look where almost no other does: their error cannot show a wrong pose."""
         optimiser = self.optimiser
         alone = torch.zeros(len(optimiser.poses), dtype=torch.bool, device=optimiser.device)
         least = optimiser.schedule.kind.alone
@@ -141,7 +141,7 @@ class LostCameraRepair:
 
     @torch.no_grad()
     def _shared(self, matrices: Tensor, image: Tensor) -> Tensor:
-        """How much [k] of what cameras of photos `image` [k] would see from poses [k, 3, 4] others see, too."""
+        """Share [k] of the view of photos `image` [k] from poses [k, 3, 4] that other cameras see, too."""
         optimiser, points = self.optimiser, []
         for part in torch.arange(len(image), device=optimiser.device).split(CHUNK // ALONE_SIDE**2):
             owner = part.repeat_interleave(ALONE_SIDE**2)
@@ -184,7 +184,7 @@ class LostCameraRepair:
         old = float(scores[0])
         # A guess need not be clearly beaten.
         rule = ANY_GAIN if bool(self.camera_errors.doubted[camera]) else REPAIRED
-        if alone:  # its own error says nothing, nor does that of another pose that shares no view
+        if alone:  # its own error says nothing, and neither does that of another pose that shares no view
             shared = self._shared(tried, image) >= optimiser.schedule.kind.alone
             if not bool(shared.any()):
                 return

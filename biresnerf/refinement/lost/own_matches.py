@@ -38,7 +38,7 @@ class OwnMatches:
 
     @classmethod
     def of(cls, scene: Scene) -> OwnMatches | None:
-        """Those of a scene; None where there are none."""
+        """The observations of a scene; None where there are none."""
         if scene.tracks is None:
             return None
         return cls(scene.tracks, [scene.dataset.camera_of(i) for i in range(len(scene.dataset))])
@@ -86,7 +86,7 @@ class OwnMatches:
 
 
 def well_matched(tracks: Tracks, count: int) -> NDArray[np.bool_]:
-    """Which of `count` images have enough pairs to say something of their poses."""
+    """Which of `count` images have enough pairs to judge their poses."""
     pairs = np.bincount(tracks.image[np.concatenate(tracks.pairs())], minlength=count)
     return np.asarray(pairs >= LEAST_PAIRS)
 

@@ -1,1 +1,1 @@
-"""The numbers that decide what a run does, by room, each with its unit and reason; the method holds them."""
+"""The numbers that decide what a run does, by package, each with its unit and reason; the method holds them."""

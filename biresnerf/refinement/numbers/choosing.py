@@ -67,7 +67,7 @@ class VerdictNumbers:
     # Before the end of a training chance is larger, as its rates have not fallen yet: 0.3 dB.
     early: float = 2  # times what matters
     measurable_px: float = 0.1  # at working size: less motion cannot be seen in photos of that size
-    # Matches speak for poses only if the error that they lose is so large a share of the motion, but for one px of it:
+    # Matches support poses only if their error drops by so large a share of the motion, apart from one px of it:
     # poses that fitted well need not move far to fit a little better (docs/verdict.md).
     explained: float = 0.1
     unexplained_px: float = 1.0  # see above

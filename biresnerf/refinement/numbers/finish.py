@@ -1,4 +1,4 @@
-"""Numbers of the adjustment of all cameras: what its evidence is worth, and when photos and time have a say."""
+"""Numbers of the adjustment of all cameras: how its evidence is weighted, and when photos and time decide."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class EvidenceNumbers:
     told_apart: float = 2.0
 
     def focal_deviation(self, source: IntrinsicsSource) -> float:
-        """Of a focal length by who found it."""
+        """The standard deviation of a focal length, by who found it."""
         known = {"given": self.focal_given, "maker": self.focal_given, "exif": self.focal_exif}
         return known.get(source, self.focal_guessed)
 
@@ -86,5 +86,5 @@ class FinishNumbers:
     # (docs/verdict.md).
     unseen_px: float = 0.5
     slack: float = 0.05  # of a run's time budget, that it may be over for a second adjustment
-    least_steps: float = 0.1  # of the steps asked for: with fewer, poses move but do not improve
+    least_steps: float = 0.1  # of the requested steps: with fewer, poses move but do not improve
     writing: float = 0.03  # of the budget, for the files of the result

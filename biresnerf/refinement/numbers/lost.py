@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class LostNumbers:
-    """Of the repair of lost cameras. When it is due within stage 1 depends on the scene: `SceneKind.repairs`."""
+    """How lost cameras are repaired. When a repair is due within stage 1 depends on the scene: `SceneKind.repairs`."""
 
     score_side: int = 20  # a pose is scored on 20 x 20 pixels spread over the photo
     references: int = 16  # cameras that stand for all others in the acceptance

@@ -29,7 +29,7 @@ class FrameNumbers:
 
 @dataclass(frozen=True)
 class ParameterNumbers:
-    """What holds exposures, lenses and rings."""
+    """What restrains exposures, lenses and rings."""
 
     # Standard deviation of the photos' logarithmic brightness from which on `auto` compensates: photos with equal
     # exposure stay below (0.02 to 0.03 in fern, horns, lund_door), with nothing to gain.

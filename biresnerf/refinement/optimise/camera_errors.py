@@ -64,7 +64,7 @@ def outliers(errors: Tensor, held_out: Tensor, numbers: ErrorNumbers) -> Tensor:
 
 
 def _middle(errors: Tensor) -> tuple[Tensor, Tensor]:
-    """Median and robust standard deviation; both zero of nothing."""
+    """Median and robust standard deviation; both zero if there are no errors."""
     if len(errors) == 0:
         return errors.new_zeros(()), errors.new_zeros(())
     median = errors.median()
@@ -115,7 +115,7 @@ class CameraErrors:
 
     @property
     def placed(self) -> NDArray[np.bool_]:
-        """Mask [n] of cameras that do not stand at a guess still."""
+        """Mask [n] of cameras that are no longer at a guessed pose."""
         return ~self.doubted.cpu().numpy()
 
     @property
@@ -148,12 +148,12 @@ class CameraErrors:
         self._weigh()
 
     def believe(self, camera: int) -> None:
-        """The camera agrees with the field of the others."""
+        """Note that the camera agrees with the field of the others."""
         self.doubted[camera] = False
         self._weigh()
 
     def add(self, image: Tensor, colour: Tensor, target: Tensor, opacity: Tensor, weight: Tensor) -> None:
-        """One batch: image, opacity and weight [rays], rendered and target colours [rays, 3]."""
+        """Add a batch: image, opacity and weight [rays], rendered and target colours [rays, 3]."""
         if self.sums.device.type != "cpu":
             self.defined_add(image, colour, target, opacity, weight)
             return

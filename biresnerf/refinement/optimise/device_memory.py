@@ -1,4 +1,4 @@
-"""Steps on a GPU whose memory may be too small for the batch that the options ask for."""
+"""Steps on a GPU whose memory may be too small for the batch that the options request."""
 
 from __future__ import annotations
 
@@ -15,10 +15,9 @@ LEAST_SHARE = 1 / 16
 
 
 def step_that_fits(optimiser: JointOptimiser) -> StepResult:
-    """A step of the joint optimisation. From where a GPU's memory is too small on, steps have half of the samples.
+    """Take a step of the joint optimisation. Once a GPU's memory proves too small, steps have half of the samples.
 
-    What a failed step has gathered of exposures' and poses' gradients adds to the next one's: it is a sample of the
-    same gradient.
+    Gradients of exposures and poses from a failed step add to the next one's: they sample the same gradient.
 
     Raises:
         torch.OutOfMemoryError: not even a sixteenth of the samples fit.
@@ -36,7 +35,7 @@ def step_that_fits(optimiser: JointOptimiser) -> StepResult:
 
 
 def smaller_batches(share: float, samples: int) -> tuple[str, ...]:
-    """A warning where batches of so many samples did not fit, but a share of them."""
+    """A warning where batches of so many samples did not fit, and only a share of them was used."""
     if share == 1:
         return ()
     return (

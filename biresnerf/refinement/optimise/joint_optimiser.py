@@ -97,8 +97,8 @@ class JointOptimiser:
         self.step_index = 0
         # The step at which stage 2 began. A method of one stage is in its last from the first step.
         self.switch: int | None = None if self.method.two_stages else 0
-        self.poses_held = False  # whether poses and lenses stay as they are
-        self.batch_share = 1.0  # of the samples asked for; less where they do not fit in memory
+        self.poses_held = False  # whether poses and lenses stay fixed
+        self.batch_share = 1.0  # of the requested samples; less where they do not fit in memory
         self.mobility = (
             torch.ones(2, len(self.poses), device=device)
             if mobility is None or not self.method.mobility
@@ -110,7 +110,7 @@ class JointOptimiser:
 
     @property
     def recipe(self) -> Recipe:
-        """That of the rest of the run, whose options may have changed on its way."""
+        """The recipe for the rest of the run, whose options may have changed on the way."""
         return Recipe(self.options, self.method, self.device, self.threads)
 
     @property
@@ -142,11 +142,11 @@ class JointOptimiser:
         self.mobility[:, self.poses.members(camera)] = 1.0
 
     def hold_poses(self) -> None:
-        """Poses and lenses stay as they are from now on."""
+        """Keep poses and lenses fixed from now on."""
         self.poses_held = True
 
     def halve_batch(self) -> None:
-        """Steps have half of the samples from now on."""
+        """Halve the samples of steps from now on."""
         self.batch_share /= 2
         self.rays = max(self.method.rays_least, self.rays // 2)
         self.field.release_memory()
@@ -217,11 +217,11 @@ class JointOptimiser:
         return 0.0 if self.poses_held else self.schedule.pose_rate(self.step_index, self.switch)
 
     def end_after(self, share: float) -> None:
-        """The run ends after so large a share of the steps that it was asked for, if not sooner."""
+        """End the run after this share of the requested steps, if not sooner."""
         self._end_at(min(self.step_index + round(share * self.options.steps), self.schedule.steps))
 
     def set_steps(self, steps: int) -> None:
-        """The run takes so many steps in all: what is left of its schedule is compressed or stretched."""
+        """Set how many steps the run takes in all: the rest of its schedule is compressed or stretched."""
         if self.switch is None:
             self._plan(steps)
         else:

@@ -1,4 +1,4 @@
-"""Methods that differ from those with a name: changed by the names of their fields, and told from each other."""
+"""Variants of the named methods: fields changed by name, and differences listed."""
 
 from __future__ import annotations
 

@@ -182,15 +182,15 @@ class Recipe:
     def of(
         cls, options: ResolvedOptions, device: torch.device, threads: int, method: Method | None = None
     ) -> Recipe:
-        """With the method that the options name, if none is given."""
+        """The recipe with the method that the options name, if none is given."""
         return cls(options, method or find_method(options.method), device, threads)
 
     def changed(self, **options: int) -> Recipe:
-        """With other values of some options."""
+        """The recipe with other values of some options."""
         return replace(self, options=self.options.model_copy(update=options))
 
     def apart(self, steps: int, coarse: tuple[int, int], samples: int) -> Recipe:
-        """For a short training: its steps, the least and the most of stage 1, and the most samples of a step."""
+        """The recipe of a short training: its steps, bounds on those of stage 1, and the most samples of a step."""
         samples, (least, most) = min(samples, self.options.samples_per_step), coarse
         return self.changed(
             steps=steps, coarse_steps_min=least, coarse_steps_max=most, samples_per_step=samples

@@ -16,8 +16,8 @@ class StepState(FrozenModel):
         switch: the step that stage 2 began at, None before.
         rays: of the next step.
         poses_held: whether poses stand still.
-        batch_share: of the samples asked for, how many fit in the device's memory.
-        planned_steps: that the lengths of the run follow from: fewer than asked for where time is short.
+        batch_share: the share of the requested samples that fits in the device's memory.
+        planned_steps: steps that the lengths of the run follow from: fewer than requested where time is short.
         steps: where the run ends.
     """
 

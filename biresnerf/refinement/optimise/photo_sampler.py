@@ -196,13 +196,13 @@ class PhotoSampler:
 
 
 def turned(places: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Places in [0, count), in order, so that they begin anywhere: rays that find no room are not always the same's."""
+    """Places in [0, count), in order from a random one, so that rays without room are not always the same image's."""
     by = torch.randint(count, (1,), generator=generator, device=generator.device).to(places.device)
     return (places + by) % count
 
 
 def _pyramid_pixels(images: ImageSet) -> int:
-    """Of all photos on all levels."""
+    """The number of pixels of all photos on all levels."""
     widths = (np.maximum(1, images.widths.astype(np.int64) >> k) for k in range(PYRAMID_LEVELS))
     heights = (np.maximum(1, images.heights.astype(np.int64) >> k) for k in range(PYRAMID_LEVELS))
     return int(sum((w * h).sum() for w, h in zip(widths, heights, strict=True)))

@@ -1,4 +1,4 @@
-"""How often each pixel of a photo is drawn: more often where colours change, which is where they tell poses.
+"""How often each pixel of a photo is drawn: more often where colours change, as those pixels determine poses.
 
 A ray's weight is its chance at an even draw over the chance it was drawn with, so that weighted means over rays are
 those over all pixels, whatever the chances are.

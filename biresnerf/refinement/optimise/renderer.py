@@ -74,7 +74,7 @@ class Renderer:
 
 
 def viewing_directions(directions: Directions, lenses: Intrinsics, image: Tensor, xy: Tensor) -> Tensor:
-    """Viewing directions float32 [rays, 3] of pixels `xy` [rays, 2] in their cameras; by gradient where lenses move.
+    """Viewing directions float32 [rays, 3] of pixels `xy` [rays, 2] in their cameras; with gradient where lenses move.
 
     `directions` is the device's, see `directions_for`.
     """

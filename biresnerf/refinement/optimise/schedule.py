@@ -72,7 +72,7 @@ class Schedule:
         return start * (end / start) ** share
 
     def far(self, far: float) -> float:
-        """Distance that sampling ends at, of the scene's own `far`; unit lengths."""
+        """Distance that sampling ends at, given the scene's own `far`; unit lengths."""
         return far
 
     def samples(self, step: int, switch: int | None) -> int:

@@ -188,7 +188,7 @@ class IntrinsicsParameters:
 
     @torch.no_grad()
     def place(self, before: Sequence[Camera], after: Sequence[Camera]) -> None:
-        """Take other intrinsics than those of the set, `before`; in the same models, and with no history."""
+        """Replace the set's intrinsics, `before`, by others of the same models, without history."""
         for row, (old, new) in enumerate(zip(before, after, strict=True)):
             self.increments[row] = increments_between(old, new, self.unit[row].cpu())
         self._adam.forget()
@@ -196,7 +196,7 @@ class IntrinsicsParameters:
 
     @property
     def _placed(self) -> list[bool]:
-        """Of each camera, whether it is not as the set has it."""
+        """For each camera, whether it differs from the set's."""
         return [bool(moved) for moved in (self.increments != 0).any(1).tolist()]
 
     @torch.no_grad()
@@ -209,18 +209,18 @@ class IntrinsicsParameters:
         self._present = None
 
     def be_certain(self, certainty: tuple[FocalCertainty | None, ...]) -> None:
-        """What is known of each focal length from now on."""
+        """Set what is known of each focal length from now on."""
         self.certainty = certainty
 
     def at(self, increments: Tensor) -> IntrinsicsParameters:
-        """These lenses at another moment's increments [cameras, columns]: to be looked at, not to be stepped."""
+        """These lenses at another moment's increments [cameras, columns], for reading only."""
         other = copy(self)
         other.increments = increments.to(self.increments)
         return other
 
     @property
     def refined_parts(self) -> tuple[RefinedPart, ...]:
-        """What of each camera was refined, in one way or another."""
+        """The parts of each camera that were refined, in any way."""
         bent = (self.increments[:, DISTORTION] != 0).any(1).tolist()
         return tuple(
             part if part != "none" or not placed else "all" if other else "focal"

@@ -1,4 +1,4 @@
-"""What an optimisation moves besides its field, in one hand: whoever needs poses takes this."""
+"""What an optimisation moves besides its field, in one object: code that needs poses takes this."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class JointParameters:
     Attributes:
         frame: the unit frame, which the poses are in.
         bodies: which cameras move together, and which not at all.
-        robust_frame: whether lost cameras have no say in where the input's frame is.
+        robust_frame: whether lost cameras do not count in finding the input's frame.
     """
 
     frame: SceneFrame

@@ -37,7 +37,7 @@ _POWERS = (3, 5, 7, 9, 3, 5, 7, 2, 2, 2, 2)
 
 
 def free_columns(camera: Camera, part: RefinedPart) -> Tensor:
-    """Which columns may move, bool [COLUMNS]: those asked for that the camera's model has."""
+    """Which columns may move, bool [COLUMNS]: those requested that the camera's model has."""
     free = torch.zeros(COLUMNS, dtype=torch.bool)
     if part == "none":
         return free

@@ -52,7 +52,7 @@ def _fixed_rows(dataset: Dataset, fixed: Sequence[str]) -> list[int]:
 
 
 def _moments(dataset: Dataset) -> list[list[int]]:
-    """Rows of the images that one frame of a COLMAP rig took, or that were cut from one panorama; where several."""
+    """Groups of several images, as rows, that one frame of a COLMAP rig took or that were cut from one panorama."""
     if dataset.cut is not None:
         groups = (np.flatnonzero(dataset.cut.rows == row).tolist() for row in range(len(dataset.cut.whole)))
         return [group for group in groups if len(group) > 1]

@@ -28,7 +28,7 @@ def nearest_shared(
 ) -> float:
     """The share of ``distance`` from which on enough of what cameras see is seen by two others.
 
-    The least where no distance reaches that: a set that shares so little needs all it has.
+    The least share where no distance reaches that: a set with so little overlap needs all of it.
 
     Args:
         unit_from_cam: [n, 4, 4]; noisy ones will do.
@@ -86,7 +86,7 @@ def witnessed(points: Tensor, cameras: Tensor, unit_from_cam: Tensor, intrinsics
 def _witnessed(
     points: Tensor, cameras: Iterable[Tensor], unit_from_cam: Tensor, intrinsics: Intrinsics
 ) -> Tensor:
-    """`witnessed`, asking some cameras after the others, and these only about points that are still in doubt."""
+    """`witnessed`, by some cameras at a time, later ones only for points that are still in doubt."""
     count = torch.zeros(len(points), dtype=torch.int64, device=points.device)
     doubtful = torch.arange(len(points), device=points.device)
     for some in cameras:

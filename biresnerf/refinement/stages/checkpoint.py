@@ -72,7 +72,7 @@ class RunRecord(FrozenModel, arbitrary_types_allowed=True):
         switch_reason: why stage 2 began.
         adjusted: whether all cameras were adjusted on the way through stage 2.
         candidates: the poses that were compared then.
-        believed: whether the evidence of then is believed.
+        believed: whether that evidence is believed.
         adjusts_again: whether cameras are adjusted after the last step, too.
         best: the poses to offer before the end; None while none were better than the input's.
         seconds: spent in each part of the run.

@@ -1,4 +1,4 @@
-"""What a run keeps and tells beside its steps: its record, curve and checkpoints, and when it is to end."""
+"""What a run keeps and reports beside its steps: its record, curve and checkpoints, and when it is to end."""
 
 from __future__ import annotations
 
@@ -51,14 +51,14 @@ class RunState:
         self.record = self.record.model_copy(update=happened)
 
     def spent(self, part: str, seconds: float) -> None:
-        """A part of the run has taken so long in all."""
+        """Record how long a part of the run has taken in all."""
         self.note(seconds={**self.record.seconds, part: seconds})
 
     @contextmanager
     def timed(self, part: Phase, phase: Phase | None = None, amount: float | None = None) -> Iterator[None]:
-        """Around a part of the run besides its steps: its seconds are recorded if it ends without an error.
+        """Context of a part of the run besides its steps: its seconds are recorded if it ends without an error.
 
-        It is a phase of the forecast, of its own name if not given, or so much of it.
+        It is ``amount`` of a phase of the forecast, by default all of the phase of the same name.
         """
         started = time.monotonic()
         with self.monitor.forecast.within(phase or part, amount):
@@ -75,7 +75,7 @@ class RunState:
         return self.ends - time.monotonic()
 
     def steps_left(self, step: int, switch: int | None, steps: int, cap: int) -> tuple[int, int]:
-        """Of stage 1, at most, and of stage 2, at a step of a run of so many whose stage 1 has at most `cap`."""
+        """The steps left of stage 1, at most, and of stage 2, in a run of `steps` whose stage 1 has at most `cap`."""
         end = steps if self.record.adjusted else max(step, round(self.monitor.forecast.share * steps))
         begin = min(cap if switch is None else switch, end)
         return max(0, begin - step), max(0, end - max(step, begin))

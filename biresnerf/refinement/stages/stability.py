@@ -41,11 +41,11 @@ class StabilityDetector:
     confirmed: int = 0
 
     def keep_between(self, floor: int, cap: int) -> None:
-        """No switch before step `floor`; always at step `cap`."""
+        """Set the limits: no switch before step `floor`; always at step `cap`."""
         self.floor, self.cap = floor, cap
 
     def check(self, step: int, mean_squared_error: float) -> Verdict:
-        """One block's result at `step`."""
+        """Add one block's result at `step`, and decide."""
         self.decibels.append(-10 * math.log10(max(mean_squared_error, 1e-12)))
         self.confirmed = self.confirmed + 1 if self._level() else 0
         if step >= self.cap:
@@ -53,7 +53,7 @@ class StabilityDetector:
         return "stable" if self.confirmed >= self.numbers.confirmations and step >= self.floor else "running"
 
     def signal(self) -> dict[str, float]:
-        """Its figures for curves: what the later half of the checks gained, and what counts as level, dB."""
+        """The detector's figures for curves: what the later half of the checks gained, and what counts as level, dB."""
         if len(self.decibels) < self.numbers.least_checks:
             return {"confirmed": self.confirmed}
         trend, _, gained = self._later_half()

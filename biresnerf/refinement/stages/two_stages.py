@@ -44,7 +44,7 @@ class PreviewTimer:
         self._period_s, self._due = min(period_s, PREVIEW_PERIOD_S), 0.0
 
     def begin(self) -> None:
-        """The run steps from now on."""
+        """Start the clock: the run steps from now on."""
         self._due = time.monotonic() + min(FIRST_PREVIEW_S, self._period_s)
 
     @property
@@ -53,7 +53,7 @@ class PreviewTimer:
 
     @contextmanager
     def showing(self) -> Iterator[None]:
-        """Around the writing of a preview: the longer it takes, the later comes the next."""
+        """Context of writing a preview: the longer it takes, the later the next one comes."""
         started = time.monotonic()
         yield
         now = time.monotonic()
@@ -64,7 +64,7 @@ class TwoStages:
     """Runs a `JointOptimiser` to its last step; can stop after any step and continue from a checkpoint.
 
     Args:
-        at_check: what it returns of the poses at each check joins that check's line of the history.
+        at_check: called with the poses at each check; its result joins that check's line of the history.
         write_preview: shows the run in files, and returns these relative to the output folder.
     """
 
@@ -116,7 +116,7 @@ class TwoStages:
         self.run.report(self._progress(CHECKPOINT.as_posix(), preview))
 
     def replan(self) -> None:
-        """The rest of the run may become shorter or longer: how long it takes has been measured."""
+        """Plan the rest of the run anew, shorter or longer, now that its speed has been measured."""
         self.run.replan()
         self._take_lengths()
 
@@ -125,7 +125,7 @@ class TwoStages:
         self.detector.keep_between(options.coarse_steps_min, options.coarse_steps_max)
 
     def begin_block(self) -> None:
-        """Cameras were given other poses: that does not count as motion within the block."""
+        """Begin a block after cameras were given other poses, so that this does not count as motion within it."""
         self._poses_at_check = self.optimiser.poses.poses()
 
     def _step(self) -> None:

@@ -74,8 +74,8 @@ def choose_start(
 ) -> InitialPoses:
     """The candidate whose poses let a field predict unseen views best, as they are or after some steps.
 
-    Where that is not decided as they are, the poses move with the field: those near the truth improve, those of a
-    wrong model do not. On a tie after that, too, the first one is kept. Cameras that all candidates guess have no say.
+    Where that is not decided with the poses fixed, they move with the field: those near the truth improve, those of a
+    wrong model do not. On a tie after that, too, the first one is kept. Cameras that all candidates guess are ignored.
 
     Args:
         explained: what `matches_explained` says of each candidate.

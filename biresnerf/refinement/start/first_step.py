@@ -42,7 +42,7 @@ def first_step(scene: Scene, recipe: Recipe) -> JointOptimiser:
 def adjusts_cameras(dataset: Dataset, method: Method) -> bool:
     """Whether all cameras are adjusted at the end, and lenses with them where there are tracks.
 
-    Not by methods of others.
+    Published methods do not.
     """
     return method.adjustment and can_be_adjusted(len(dataset))
 

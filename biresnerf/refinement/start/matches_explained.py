@@ -1,4 +1,4 @@
-"""How much of the feature matches that no mapping was shown a set of poses explains."""
+"""How well a set of poses explains the feature matches that were left out of the mapping."""
 
 from __future__ import annotations
 

@@ -33,18 +33,18 @@ class RefinedPoses:
 
     @classmethod
     def now(cls, dataset: Dataset, joint: JointParameters) -> RefinedPoses:
-        """Those of this moment."""
+        """The present poses and lenses."""
         return cls.at(dataset, joint, joint.unit_from_cam, joint.lenses)
 
     def input_from_unit(self, frame: SceneFrame) -> Similarity:
-        """From the unit frame that the optimisation is in."""
+        """The similarity from the unit frame that the optimisation is in."""
         return self.input_from_optimised @ frame.unit_from_world.inverse()
 
     @classmethod
     def at(
         cls, dataset: Dataset, joint: JointParameters, unit_from_cam: Array, lenses: IntrinsicsParameters
     ) -> RefinedPoses:
-        """Those of any moment, [n, 4, 4] in the unit frame. The optimisation leaves frame and scale free.
+        """The poses of any moment, [n, 4, 4] in the unit frame. The optimisation leaves frame and scale free.
 
         The similarity that fits the optimised poses to the given ones best fixes them; it is robust to lost cameras
         unless the method says otherwise. Fixed cameras and rigs leave less free. Where nobody gave poses, measured

@@ -1,4 +1,4 @@
-"""In what order photos were taken around an object, told by their names and by how alike they look.
+"""In what order photos were taken around an object, by their names and by how alike they look.
 
 Names give the order within a run of photos that each resemble the next. Where they do not, the table or the camera was
 moved, possibly laid on its side: the runs are put together, either way round and turned by quarters, so that the photos
@@ -64,7 +64,7 @@ def turned_distances(small: NDArray[np.float32]) -> NDArray[np.float64]:
 def find_ring(images: ImageSet, named: NDArray[np.int64]) -> RingOrder:
     """The photos' order around the object, from that of their names: indices [n] in `named`.
 
-    More than `RUNS_MOST` runs leave the order as it is named: then neither says how they would meet.
+    With more than `RUNS_MOST` runs the order of names is kept: then nothing shows how the runs meet.
     """
     apart = turned_distances(thumbnails(images))
     steps = apart[named[:-1], named[1:], 0]

@@ -7,7 +7,7 @@ with a wrong one fits itself to it, so its gradient says little, but a parabola 
 unexplained does.
 
 Seen from far away, a ring that turns the other way at the opposite elevation about an object mirrored in depth gives
-the same photos (the bas-relief ambiguity); perspective tells them apart, so both ways are tried.
+the same photos (the bas-relief ambiguity); perspective distinguishes them, so both ways are tried.
 """
 
 from __future__ import annotations
@@ -169,7 +169,7 @@ def rings_to_try(images: ImageSet, order: RingOrder, elevations_deg: Sequence[fl
 
 
 def refuse_still_background(images: ImageSet) -> None:
-    """What all photos show alike around what turns would be taken for a part of it.
+    """Refuse photos whose background stands still: it would be taken for a part of what turns.
 
     Raises:
         InputError: ``insufficient_overlap``.
