@@ -64,7 +64,7 @@ class Judgement:
         renders: of some held-out views, in the verdict's training on the input's poses and on the refined ones.
         sharpness, gain: see `image_flags`.
         contradicted, contradicted_before, moved_far, blurred, exposure_off: bool.
-        errors: what the evidence says of those of the refined poses; None where it says nothing, or nobody had to know.
+        errors: expected errors of the refined poses; None where the evidence gives none, or they were not needed.
     """
 
     verdict: Verdict
@@ -101,7 +101,7 @@ def judge_poses(
     Fields are trained in as many rounds as there is time for, and in one of the usual length in any case.
 
     Args:
-        lost: how many cameras agree with no pose found.
+        lost: how many cameras have no fitting pose.
         finish: with the poses that fit all evidence that is to be trusted.
 
     Raises:
@@ -144,7 +144,7 @@ def judge_poses(
 
 
 def _determined(errors: ExpectedErrors | None, finish: Finish) -> float | None:
-    """The share of cameras that the evidence determines; none where photos, or its noise, spoke against all of it."""
+    """The share of cameras that the evidence determines; none where photos, or its noise, contradicted all of it."""
     if finish.fit is None and finish.candidates:
         return 0.0
     return None if errors is None else float(errors.known.mean())
@@ -169,7 +169,7 @@ class Compared:
 
 
 def compare_without_training(scene: Scene, refined: RefinedPoses, lost: int, method: Method) -> Compared:
-    """The input's poses and refined ones by motion and feature matches; `lost` cameras agree with no pose found."""
+    """Compare the input's poses and refined ones by motion and feature matches; `lost` cameras have no fitting pose."""
     dataset, images, numbers = scene.dataset, scene.images, method.verdict
     rows = range(len(dataset))
     before = Rig(dataset.world_from_cam, tuple(dataset.camera_of(i) for i in rows))

@@ -25,12 +25,12 @@ def compare_on_matches(
 ) -> EpipolarEvidence | None:
     """Each image's median epipolar error with either rig; None where too few images have matches.
 
-    The evidence is of points that were left out of every estimate, where they know half of the images that all points
-    know. Images without a pose before say nothing: any pose is better than a guess.
+    The points are those left out of every estimate, if they are seen in half of the images in which all points are.
+    Images without a pose before do not count: any pose is better than a guess.
 
     Args:
         placed: which images [n] had more than a guess for a pose before.
-        least: images with matches that say anything.
+        least: images with matches that are needed for a finding.
         started_from_matches: whether points not left out had a part in the rig `after`.
     """
     counted = placed if placed.any() else ~placed

@@ -30,10 +30,10 @@ def pose_uncertainty(
     judgement: Judgement | None,
     lost: NDArray[np.bool_],
 ) -> tuple[PoseUncertainty, ...]:
-    """Of each image's returned pose.
+    """The uncertainty of each image's returned pose.
 
     Args:
-        lost: cameras [n] that agree with no pose found.
+        lost: cameras [n] that have no fitting pose.
         finish: with the poses that fit all evidence that is to be trusted.
         judgement: None where there is no verdict, and the refined poses are returned.
     """

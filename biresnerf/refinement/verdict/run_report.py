@@ -46,9 +46,9 @@ class Findings:
     Attributes:
         scores: of held-out views, as far as they are scored.
         judgement: None where there is no verdict.
-        finish: what came of the adjustment of all cameras; None as long as the run is not complete.
+        finish: the result of the adjustment of all cameras; None as long as the run is not complete.
         uncertainty: of each image's returned pose, or nothing.
-        so_far: what a run offers that has no verdict yet; the present poses if not given.
+        so_far: the best poses of a run that has no verdict yet; by default the present poses.
     """
 
     scores: Sequence[ViewScore] = ()
@@ -139,7 +139,7 @@ def _percent(known: FocalCertainty | None) -> float | None:
 
 
 def focal_warnings(dataset: Dataset, lenses: IntrinsicsParameters) -> tuple[str, ...]:
-    """Of focal lengths that were given and kept, although the evidence clearly prefers others."""
+    """Warnings on focal lengths that were given and kept, although the evidence clearly prefers others."""
     found = []
     for i, known in enumerate(lenses.certainty):
         if known is None or known.contradicts is None or known.deviation is None:
@@ -194,7 +194,7 @@ def gpu_warnings(device: torch.device) -> tuple[str, ...]:
 
 
 def unmatched_warnings(scene: Scene) -> tuple[str, ...]:
-    """A warning that names the images that matches left out of a set they mostly placed, and that no tracks show."""
+    """A warning that names images without tracks that matches did not place, in a set that they mostly placed."""
     tracks, count = scene.tracks, len(scene.dataset)
     observed = np.zeros(count) if tracks is None else np.bincount(tracks.image, minlength=count)
     unmatched = np.flatnonzero(scene.start.unmatched & (observed < LEAST_PAIRS)).tolist()

@@ -52,9 +52,9 @@ def poses_so_far(
 ) -> SoFar:
     """Measure the present poses, keep them if they are the best, and return the best.
 
-    The input's poses are the first candidate, and poses follow them that the verdict's rule returns. Later ones take
-    their place unless matches say that they are worse than the best ever measured, by as much as matters. No field is
-    trained for it: it takes as long as a few steps.
+    The input's poses come first, then any that the verdict's rule returns. Later ones replace these unless matches show
+    that they are significantly worse than the best ever measured. No field is trained: this takes as long as a few
+    steps.
     """
     best, now = run.record.best, RefinedPoses.now(scene.dataset, joint)
     if not recipe.options.verdict:
@@ -80,7 +80,7 @@ def poses_so_far(
 def _verdict(
     scene: Scene, joint: JointParameters, camera_errors: CameraErrors, recipe: Recipe, refined: RefinedPoses
 ) -> Verdict:
-    """By all but unseen views; where nothing else speaks for or against them, refined poses are offered."""
+    """The verdict by all but unseen views; where nothing supports or contradicts them, refined poses are offered."""
     lost, method = int(camera_errors.lost.sum()), recipe.method
     findings = compare_without_training(scene, refined, lost, method).findings
     if matches_are_better(findings) and method.uncertainty:

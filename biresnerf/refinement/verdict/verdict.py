@@ -76,7 +76,7 @@ class Findings:
 
     @property
     def by_matches(self) -> Finding:
-        """What feature matches may say of the refined poses: they speak for these where they explain the motion."""
+        """What feature matches may say of the refined poses: they support them only where they explain the motion."""
         if self.epipolar is not None and self.epipolar.error_px.finding == "worse":
             return "worse"
         better = matches_are_better(self) and self.explained and not self.undetermined
@@ -89,7 +89,7 @@ class Findings:
 
 
 def failed_checks(refined: Array, lost: int, numbers: VerdictNumbers) -> tuple[str, ...]:
-    """Sentences on what is inconsistent about refined poses [n, 4, 4]; `lost` cameras agree with no pose found."""
+    """Sentences on what is inconsistent about refined poses [n, 4, 4]; `lost` cameras have no fitting pose."""
     if not np.isfinite(refined).all():
         return ("Refined poses are not finite.",)
     if lost > numbers.mostly * len(refined):
@@ -116,10 +116,10 @@ def frame_doubt(turned_deg: Array, shifted: Array, spread: float, numbers: Verdi
 def decide(findings: Findings) -> Verdict:
     """The verdict by the rules of docs/verdict.md."""
     name, ground = _judge(findings)
-    # Where nothing speaks for either, poses that somebody gave stay, as do found ones while the evidence is weak. Mere
-    # guesses do not, nor found ones that measure the same: left-out tracks and patches chose the refined ones. Nor do
-    # found ones where left-out matches fit the refined ones better, or where these alone heed measured places, and
-    # nothing speaks against them.
+    # Where nothing supports either, given poses stay, as do found ones while the evidence is weak. Mere guesses yield,
+    # and so do found ones that measure the same, as left-out tracks and patches chose the refined ones. Found ones also
+    # yield where left-out matches fit the refined ones better, or where these alone use measured places, and nothing
+    # contradicts them.
     yields = _measures_the_same(findings) if name == "unchanged" else not findings.grounded
     yields = yields or _found_poses_yield(findings)
     keep = name != "improved" and not (name in ("unchanged", "inconclusive") and yields)
@@ -172,7 +172,7 @@ def _judge(f: Findings) -> tuple[VerdictName, str]:
 
 
 def _without_a_voice(f: Findings) -> tuple[VerdictName, str]:
-    """Where nothing may speak, for or against."""
+    """The finding where no evidence counts, for or against."""
     if matches_are_better(f) and f.undetermined:
         return (
             "inconclusive",
@@ -206,9 +206,9 @@ def _measures_the_same(f: Findings) -> bool:
 
 
 def _found_poses_yield(f: Findings) -> bool:
-    """Whether poses that matches gave yield to refined ones, against which nothing speaks.
+    """Whether poses that matches gave yield to refined ones, which nothing contradicts.
 
-    They do where the refined ones alone heed measured places, or fit left-out matches better.
+    They do where the refined ones alone use measured places, or fit left-out matches better.
     """
     if f.compared_with != "seeded" or f.faults or _who_say(f, "worse"):
         return False
@@ -218,7 +218,7 @@ def _found_poses_yield(f: Findings) -> bool:
 
 
 def _counted(f: Findings) -> list[PairedDifference]:
-    """The comparisons that may speak for the refined poses."""
+    """The comparisons that may support the refined poses."""
     counted = [f.heldout.psnr] if f.heldout is not None else []
     if f.epipolar is not None and f.epipolar.independent:
         counted.append(f.epipolar.error_px)
@@ -226,7 +226,7 @@ def _counted(f: Findings) -> list[PairedDifference]:
 
 
 def _who_say(f: Findings, finding: Finding) -> list[str]:
-    """What says that the refined poses are better, or worse; matches that the start came from may say the latter."""
+    """The evidence that the refined poses are better, or worse; matches that gave the start only count for worse."""
     if finding == "better":
         views = _views_are_better(f) and (_views_tell(f) or (matches_are_better(f) and not f.undetermined))
     else:
@@ -241,7 +241,7 @@ def _views_are_better(f: Findings) -> bool:
 
 
 def _views_tell(f: Findings) -> bool:
-    """Whether unseen views may speak alone, or against matches: poses that fit photos better may miss them by far."""
+    """Whether unseen views may decide alone, or against matches: poses that fit photos better may miss them by far."""
     missed = f.heldout.missed_px if f.heldout is not None else None
     return missed is None or (photos_tell(missed, f.moved_px, f.numbers) and not f.may_be_blur)
 

@@ -51,8 +51,8 @@ class Rig:
 def moved_px(before: Rig, after: Rig, images: ImageSet) -> float:
     """How far the scene moves in the image (px, working size) between two rigs in one frame: median over cameras.
 
-    Looked at are points of a grid over each image, as far as the point that the rig `before` looks at; each camera
-    counts with their mean, and no point with more than the image's long side.
+    Measured at points of a grid over each image, at the distance of the point that the rig `before` looks at. Each
+    camera counts with their mean, and each point with at most the image's long side.
     """
     n = len(images)
     old, new = (Intrinsics.from_cameras(rig.lenses(images)) for rig in (before, after))
@@ -80,12 +80,12 @@ class Effort:
     """How much is trained to compare two rigs.
 
     Attributes:
-        times: the steps that the options say are taken so many times.
-        rounds_most: small sets are trained so often at most, with other views left out, unless the first ones decide.
+        times: how many times the options' steps are taken.
+        rounds_most: most rounds of small sets, each with other views left out; fewer if the first ones decide.
         looks: shares of a training after which fields are compared; the last is 1.
         pictured: whether some held-out views are rendered with either rig, to be looked at.
         favoured: what other evidence says of the second rig.
-        moved_px: how far the scene moves in the image between the rigs, where that is of account.
+        moved_px: how far the scene moves in the image between the rigs, where that matters.
     """
 
     times: int = 1
@@ -102,7 +102,7 @@ class HeldOutComparison:
 
     Attributes:
         work: of all trainings, see `Trial.work`.
-        renders: of some held-out views [h, w, 3] with either rig, by their index, if they were asked for.
+        renders: of some held-out views [h, w, 3] with either rig, by their index, if requested.
     """
 
     views: list[int]
@@ -123,7 +123,7 @@ def compare_on_unseen_views(
     report: Callable[[float], None] = lambda _share: None,
     effort: Effort = Effort(),
 ) -> HeldOutComparison | None:
-    """Train a field on either rig, held still, and score both on the same unseen views; None of too few images.
+    """Train a field on either rig, held still, and score both on the same unseen views; None for too few images.
 
     Trainings end at the first of the looks that decides.
 
@@ -194,7 +194,7 @@ def _pictures(
 
 
 def _missed_px(scores: TrialScores, images: ImageSet, views: Sequence[int]) -> float:
-    """Of the median view."""
+    """The `shift_px` of the median view."""
     missed = []
     for view, error_db in zip(views, scores.psnr.tolist(), strict=True):
         photo: NDArray[np.float32] = images.image(view).astype(np.float32) / np.float32(255)
@@ -203,12 +203,12 @@ def _missed_px(scores: TrialScores, images: ImageSet, views: Sequence[int]) -> f
 
 
 def photos_tell(missed_px: float, moved_px: float, numbers: VerdictNumbers) -> bool:
-    """Whether renders with the better poses are near enough to the photos to tell others that differ by a motion."""
+    """Whether renders with the better poses are near enough to the photos to distinguish poses a motion apart."""
     return missed_px <= max(numbers.blur_px, numbers.nearer * moved_px)
 
 
 def may_be_blur(evidence: HeldOutEvidence, effort: Effort, numbers: VerdictNumbers) -> bool:
-    """Whether a gain may be that of poses which a short training's blur suits, and nothing else speaks for them."""
+    """Whether a gain may only be of poses that suit a short training's blur, without any other support."""
     if effort.favoured == "better" or evidence.psnr.finding != "better" or evidence.missed_px is None:
         return False
     return numbers.nearer * effort.moved_px < evidence.missed_px <= numbers.blur_px

@@ -27,7 +27,7 @@ def unshared_opacity(
 
     Opacity is the weights T_k alpha_k of the samples (`reference.composite`). A training camera counts where its image
     shows the point, whatever stands between: frusta, as in the visibility loss of Nerfbusters (Warburg et al. 2023).
-    That asks for one camera; but nothing contradicts what only one sees. 0 where nothing is rendered.
+    That requires one camera; but nothing contradicts what only one sees. 0 where nothing is rendered.
 
     Args:
         held_out: bool [n], images that the field was not trained on.

@@ -36,7 +36,7 @@ def held_out_views(
 
 
 def unseen_views(count: int, held_out: Sequence[int], numbers: ViewNumbers) -> list[int]:
-    """The views that the verdict is passed on: those held out by the refinement, and others, evenly spread.
+    """The views that the verdict is based on: those held out by the refinement, and others, evenly spread.
 
     `most_unseen` in all, unless more are held out; at least `least_views` where no more than a third of all are needed.
     """

@@ -2,8 +2,8 @@
 
 Everything but the poses (and the lenses, where they were refined too) is the same in each: photos, unseen views, scene
 box, steps, samples and random seed. Unseen views are rendered from the poses as they stand, fitted to no field: a fit
-would hide the errors under comparison. Each set is scored within its own field, so it need not share its frame's last
-digits with the others. Where poses move, those of the unseen views follow the field without training it.
+would hide the errors under comparison. Each set is scored within its own field, so frames need not agree to the last
+digit. Where poses move, those of the unseen views follow the field without training it.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ class Trial:
 
     @property
     def work(self) -> float:
-        """Of the steps so far, in steps of a scene with a background."""
+        """The work of the steps so far, in steps of a scene with a background."""
         return self.optimiser.step_index * self.optimiser.schedule.kind.step_work
 
     def scores(self) -> TrialScores:
