@@ -1,1 +1,1 @@
-"""Measurements: of speed (`make bench`), of the method, of the service, under load and under chaos."""
+"""Benchmarks of speed (`make bench`), of the method, and of the service under load and chaos."""

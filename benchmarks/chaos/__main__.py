@@ -30,7 +30,7 @@ from workers.store.trash import RETRY_S
 
 @contextlib.asynccontextmanager
 async def surroundings(folder: Path) -> AsyncIterator[Surroundings]:
-    """Of real jobs."""
+    """The disk, object store and clock of a storm with real jobs."""
     disk, store = SmallDisk(folder / "disk"), ObjectStore(free_port(), free_port(), folder / "store.log")
     try:
         async with store.serving():
@@ -50,7 +50,7 @@ async def storm(
     within_s: float = math.inf,
     around: Surroundings | None = None,
 ) -> tuple[list[Claim], dict[str, Any]]:
-    """Run the jobs under faults; what has to hold, and what happened. With ``around`` they are real."""
+    """Run jobs under faults; returns the claims and what happened. With ``around``, jobs are real."""
     began = time.monotonic()
     installation = Installation(folder, replicas=2, workers=workers, around=around)
     kind = Clients if around is None else RealClients
@@ -68,7 +68,7 @@ async def storm(
         seconds = time.monotonic() - began
         claims = claims_about_jobs(clients)
         async with open_database(installation.postgres.url, connections=2) as database:
-            # A folder that got a file while it was deleted is tried again after a while.
+            # A folder that received a file during its deletion is retried later.
             patience_s = RETRY_S + 20 + 4 * installation.settings.stall_s
             claims += await claims_about_rest(installation, database, patience_s)
     claims.append(Claim("no process is left", installation.left_over()))
@@ -86,16 +86,16 @@ async def storm(
 
 
 def new_folder() -> Path:
-    """In memory where there is room: a database on a busy disk takes longer to start than workers to stall."""
+    """A folder in memory if there is room: on a busy disk, the database starts more slowly than workers stall."""
     memory = Path("/dev/shm")
     roomy = memory.is_dir() and os.access(memory, os.W_OK) and shutil.disk_usage(memory).free > 2**30
     folder = Path(tempfile.mkdtemp(prefix="biresnerf-chaos-", dir=memory if roomy else None))
-    folder.chmod(0o711)  # PostgreSQL's user must get through
+    folder.chmod(0o711)  # PostgreSQL's user must be able to enter
     return folder
 
 
 async def real_storm(folder: Path, **asked: Any) -> tuple[list[Claim], dict[str, Any]]:
-    """With refinements, on a small disk, with an object store; raises `SystemExit` where that cannot be had."""
+    """A storm with real refinements, a small disk and an object store; raises `SystemExit` if these are unavailable."""
     if missing := lacking():
         raise SystemExit(f"A storm with real jobs needs {', '.join(missing)}.")
     async with surroundings(folder) as around:

@@ -1,4 +1,4 @@
-"""Clients as a careful user writes them: each call again until it is answered, on any replica."""
+"""Clients as careful users write them: they repeat each call, on any replica, until it is answered."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Seen:
     faults: list[str] = field(default_factory=list)
 
     def expected(self) -> set[str]:
-        """States that would be right at the end."""
+        """The correct final states."""
         if self.kind == "cancelled":
             if self.state_at_cancel in FINAL:
                 return {str(self.state_at_cancel)}
@@ -58,10 +58,10 @@ class Clients:
         self._http = httpx.AsyncClient(timeout=ANSWER_S)
 
     async def prepare(self) -> None:
-        """Before the first fault."""
+        """Set up, before the first fault."""
 
     async def run(self, count: int, at_once: int, within_s: float = math.inf) -> None:
-        """Until all jobs are final and looked through; after ``within_s`` none is submitted any more."""
+        """Run until all jobs are final and checked; submits none after ``within_s``."""
         turn, end = asyncio.Semaphore(at_once), time.monotonic() + within_s
 
         async def one(seen: Seen) -> None:
@@ -87,12 +87,12 @@ class Clients:
         return Seen(kind, plan)
 
     async def submit_and_follow(self, seen: Seen) -> None:
-        """From its dataset to its result."""
+        """Submit a job and follow it to its result."""
         await self.submit(seen)
         await self.see_through(seen)
 
     async def see_through(self, seen: Seen) -> None:
-        """From its place in the queue to its result."""
+        """Follow a queued job to its result."""
         live = asyncio.create_task(self._follow(seen.job["id"]))
         if seen.kind == "cancelled":
             await asyncio.sleep(self.chance.uniform(0, 4.0))
@@ -105,7 +105,7 @@ class Clients:
         await self.look_through(seen)
 
     async def submit(self, seen: Seen) -> None:
-        """Its dataset, and its place in the queue."""
+        """Create the dataset and submit the job."""
         dataset = (await self.json("POST", "/v1/datasets", json={"name": "chaos"}))["id"]
         content = json.dumps(seen.plan).encode()
         if self.chance.random() < 0.5:
@@ -121,7 +121,7 @@ class Clients:
         )
 
     async def _send_archive(self, dataset: str, files: dict[str, bytes]) -> None:
-        """By a resumable upload, which some process unpacks once it is whole."""
+        """Send files by a resumable upload, which some process unpacks once it is complete."""
         packed = io.BytesIO()
         with zipfile.ZipFile(packed, "w") as archive:
             for name, content in files.items():
@@ -139,12 +139,12 @@ class Clients:
         answer = await self.call(method, path, **request)
         if answer.status_code >= 300:
             raise RuntimeError(f"{method} {path}: {answer.status_code} {answer.text}")
-        # A file that is sent again, as the first answer was lost, is answered by nothing.
+        # The response to a file that is sent again, after the first one was lost, is empty.
         found: dict[str, Any] = answer.json() if answer.content else {}
         return found
 
     async def call(self, method: str, path: str, **request: Any) -> httpx.Response:
-        """The first answer that is not 'try again'."""
+        """Repeat a request until its answer is not 'try again'."""
         while True:
             url = self.chance.choice(self._urls)
             try:
@@ -158,7 +158,7 @@ class Clients:
             await asyncio.sleep(self.chance.uniform(0.1, 0.5))
 
     async def _follow(self, job_id: str) -> list[dict[str, Any]]:
-        """The whole history by server-sent events, resumed wherever the stream broke."""
+        """The whole history by server-sent events, resumed where the stream broke."""
         events: list[dict[str, Any]] = []
         while not events or events[-1]["type"] not in FINAL:
             headers = {"Last-Event-ID": str(events[-1]["seq"])} if events else {}
@@ -188,7 +188,7 @@ class Clients:
 
 
 def chain(seed: str, steps: int) -> str:
-    """What the counting program comes to, through however many attempts."""
+    """The counting program's result, which must not depend on the number of attempts."""
     for step in range(1, steps + 1):
         seed = hashlib.sha256(f"{seed}{step}".encode()).hexdigest()
     return seed

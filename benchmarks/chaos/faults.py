@@ -1,6 +1,6 @@
-"""What goes wrong, at random: processes killed, frozen and told to end, the database restarted and frozen.
+"""Random faults: processes are killed, frozen and terminated, the database is restarted and frozen.
 
-Around real jobs also a disk that fills, a store that refuses or falls silent, and a clock an hour off.
+With real jobs also: a full disk, a store that refuses or hangs, and a clock an hour off.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from benchmarks.chaos.surroundings import Surroundings
 
 
 class Faults:
-    """Does one thing after the other to an installation; `done` counts them by name."""
+    """Injects faults into an installation, one after the other; `done` counts them by name."""
 
     def __init__(self, installation: Installation, chance: random.Random, every_s: float) -> None:
         self._installation, self._chance, self._every_s = installation, chance, every_s
@@ -26,7 +26,7 @@ class Faults:
         self._under_way: set[asyncio.Task[None]] = set()
 
     async def run(self, until: asyncio.Event) -> None:
-        """Faults until the event; then everything goes on again."""
+        """Inject faults until the event, then wait until all are over."""
         deck: list[Callable[[], Awaitable[None]]] = []
         while not until.is_set():
             deck = deck or self._shuffled()
@@ -38,7 +38,7 @@ class Faults:
         await asyncio.gather(*self._under_way)
 
     def _shuffled(self) -> list[Callable[[], Awaitable[None]]]:
-        """Each kind once, so that a short run has them all, too."""
+        """Each kind once, so that even a short run has all of them."""
         deck = [
             *(self._kill_worker, self._freeze_worker, self._end_worker, self._kill_job, self._freeze_worker),
             *(self._kill_api, self._end_api, self._freeze_api),
@@ -116,7 +116,7 @@ class Faults:
         while postgres.alive:
             await asyncio.sleep(0.05)
         await asyncio.sleep(away_s)
-        postgres.start()  # in this thread, to whose life the server's is tied
+        postgres.start()  # in this thread: the server dies with it
 
     def _one(self, kept: list[Kept]) -> int | None:
         return self._chance.choice(kept).pid

@@ -1,4 +1,4 @@
-"""A whole installation as processes of this one: PostgreSQL, API replicas, workers; what ends is started again."""
+"""A whole installation as child processes: PostgreSQL, API replicas, workers; they are restarted when they end."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ _FOUND = CheckReport(
     intrinsics=("given",), format="colmap", masks=0, transparency=False, warnings=(),
 )  # fmt: skip
 CHECK = f"print({json.dumps({'report': _FOUND.model_dump(mode='json')})!r})"
-PAUSE_S = 0.3  # before what ended is started again, as a container's restart policy would
+PAUSE_S = 0.3  # pause before a restart, as by a container's restart policy
 
 
 def free_port() -> int:
-    """A port that nobody listens on just now."""
+    """A port that is free at the moment."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
@@ -41,7 +41,7 @@ def free_port() -> int:
 
 
 def quick_settings(data_dir: Path, database_url: str, **changes: object) -> Settings:
-    """Everything that production waits for, in tenths of a second; jobs count."""
+    """Settings with short intervals in place of production's; jobs run the counting program."""
     values: dict[str, object] = {
         "data_dir": data_dir,
         "database_url": database_url,
@@ -50,11 +50,11 @@ def quick_settings(data_dir: Path, database_url: str, **changes: object) -> Sett
         "poll_s": 0.5,
         "janitor_s": 0.5,
         "stop_grace_s": 5.0,
-        # After this long, what a killed API process stored and did not record is deleted.
+        # When files that a killed API process stored but did not record are deleted.
         "upload_expiry_s": 15.0,
-        # Innocent jobs are hit by faults again and again; those that die of themselves must still fail soon.
+        # Good jobs are hit by faults repeatedly; jobs that always crash must still fail soon.
         "max_attempts": 12,
-        # Whatever else the machine does, somebody waits for these jobs.
+        # Jobs must not give way to other work on the machine.
         "job_nice": 0,
         "job_command": (sys.executable, str(PROGRAM)),
         "check_command": (sys.executable, "-S", "-c", CHECK),
@@ -75,7 +75,7 @@ class Kept:
 
     @property
     def pid(self) -> int | None:
-        """Of the running process."""
+        """The PID of the running process."""
         alive = self.process is not None and self.process.returncode is None
         return self.process.pid if alive and self.process is not None else None
 
@@ -84,16 +84,16 @@ REAL_PROGRAMS = {name: Settings.model_fields[name].default for name in ("job_com
 
 
 def real_settings(around: Surroundings) -> dict[str, object]:
-    """What differs from `quick_settings` where jobs are real: loading their libraries takes all cores for seconds."""
+    """Changes to `quick_settings` for real jobs: loading their libraries takes all cores for seconds."""
     waits = {"beat_s": 1.0, "stall_s": 6.0}
     return {**REAL_PROGRAMS, **waits, "disk_reserve_bytes": RESERVE_BYTES, **around.store.settings()}
 
 
 class Installation:
-    """Starts all in ``folder``; `ports` are those of the API replicas. Use as an async context manager.
+    """Starts everything in ``folder``; `ports` are the API replicas'. Use as an async context manager.
 
-    With ``around`` jobs and checks are real, files are in its store, all scratch folders on its disk, and the first
-    worker has its clock.
+    With ``around``, jobs and checks are real, files are in its store, scratch folders on its disk, and the first worker
+    has its clock.
     """
 
     def __init__(
@@ -150,7 +150,7 @@ class Installation:
             self.postgres.stop()
 
     def add(self, worker: Kept) -> None:
-        """One more worker, from now on."""
+        """Add a worker."""
         self.workers.append(worker)
         self._keeping.append(asyncio.create_task(self._keep(worker)))
 
@@ -166,7 +166,7 @@ class Installation:
         log = self.folder / f"{kept.name}.log"
         while kept.wanted and not self._closing:
             with log.open("ab") as output:
-                # Without a file for their standard input children would share the terminal.
+                # Children must not share the terminal as standard input.
                 kept.process = await asyncio.create_subprocess_exec(
                     *dying_with_parent(list(kept.command), signal_number=signal.SIGKILL),
                     stdin=asyncio.subprocess.DEVNULL,
@@ -181,7 +181,7 @@ class Installation:
             await asyncio.sleep(PAUSE_S)
 
     def environment(self) -> dict[str, str]:
-        """Of each process."""
+        """The environment of each process."""
         said = {
             f"BIRESNERF_{name.upper()}": value if isinstance(value, str) else json.dumps(value)
             for name, value in self.settings.model_dump(
@@ -191,7 +191,7 @@ class Installation:
         return {**os.environ, **said, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
 
     def job_processes(self) -> list[int]:
-        """Pids of the processes of jobs."""
+        """The PIDs of job processes."""
         found = []
         for kept in self.workers:
             with contextlib.suppress(psutil.Error):
@@ -201,14 +201,14 @@ class Installation:
         return found
 
     def stored_keys(self) -> set[str]:
-        """Of all files in the store."""
+        """The keys of all files in the store."""
         if self.around is not None:
             return self.around.store.keys()
         root = self.settings.files_dir
         return {path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file()}
 
     def database_processes(self) -> list[int]:
-        """Pids of the server and its backends."""
+        """The PIDs of the server and its backends."""
         assert self.postgres.process is not None, "started"
         with contextlib.suppress(psutil.NoSuchProcess):
             server = psutil.Process(self.postgres.process.pid)
@@ -216,7 +216,7 @@ class Installation:
         return []
 
     def left_over(self) -> list[str]:
-        """Command lines of processes that still work in our folder."""
+        """The command lines of processes that still run in our folder."""
         found = []
         for process in psutil.process_iter(["pid", "cmdline", "cwd", "status"]):
             words = " ".join(process.info["cmdline"] or ())

@@ -15,7 +15,7 @@ from benchmarks.chaos.clients import FINAL, Clients, Kind, Seen
 
 VIEWS, SIZE = 6, 32
 DATASETS = 20
-# Written last, or holding what was computed.
+# Files that are written last, or hold results.
 RESULT = {"log.txt", "poses.json", "report.json", "transforms.json", "scene.glb", "tum.txt", "view.json"}
 OPTIONS = {
     "preset": "fast",
@@ -53,7 +53,7 @@ class RealClients(Clients):
 
     def planned(self, n: int) -> Seen:
         kinds: list[Kind] = ["good"] * 8 + ["cancelled"] * 2
-        # Of a job that the clients know of only from the service there is no journal.
+        # Jobs that the clients know only from the service have no journal.
         return Seen(kinds[n % 10], {"journal": str(self.folder / "no-journal"), "dataset": n % DATASETS})
 
     async def submit(self, seen: Seen) -> None:
@@ -97,7 +97,7 @@ class RealClients(Clients):
 
 
 def faults_of(contents: dict[str, bytes]) -> list[str]:
-    """What is wrong with a result: files that lack, steps not made, poses that are none."""
+    """What is wrong with a result: missing files or steps, or invalid poses."""
     if not set(contents) >= RESULT:
         return [f"the result is not whole: {sorted(contents)}"]
     report: dict[str, Any] = json.loads(contents["report.json"])

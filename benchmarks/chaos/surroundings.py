@@ -1,4 +1,4 @@
-"""What real jobs depend on outside of us, and what goes wrong with it: a small disk, an object store, a clock."""
+"""External resources of real jobs, with their faults: a small disk, an object store, a clock."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def lacking() -> list[str]:
 
 
 class SmallDisk:
-    """A file system of its own, so small that it can be filled."""
+    """A separate file system, small enough to be filled."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -41,11 +41,11 @@ class SmallDisk:
         subprocess.run(["mount", "-t", "tmpfs", "-o", options, "tmpfs", folder], check=True)
 
     def unmount(self) -> None:
-        """At the end, whatever is left there."""
+        """Unmount it, with whatever is left there."""
         subprocess.run(["umount", "--lazy", self.folder], check=True)
 
     async def fill(self, seconds: float) -> None:
-        """To the last byte, for a while; a file that grows takes what others give back."""
+        """Fill it to the last byte for a while; keeps taking the space that others free."""
         ballast = self.folder / "ballast"
         end = asyncio.get_running_loop().time() + seconds
         with ballast.open("wb", buffering=0) as file:
@@ -58,7 +58,7 @@ class SmallDisk:
 
 
 class ObjectStore:
-    """An S3 server in a process of its own, reached through a relay that can be cut."""
+    """An S3 server in a separate process, reached through a relay that can be cut."""
 
     def __init__(self, port: int, relay_port: int, log: Path) -> None:
         self._port, self._relay_port, self._log = port, relay_port, log
@@ -68,7 +68,7 @@ class ObjectStore:
 
     @contextlib.asynccontextmanager
     async def serving(self) -> AsyncIterator[None]:
-        """Runs it, with an empty bucket."""
+        """Runs the server with an empty bucket."""
         command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(self._port)]
         with self._log.open("ab") as log:
             self._process = subprocess.Popen(
@@ -90,7 +90,7 @@ class ObjectStore:
             self._process.wait()
 
     def settings(self) -> dict[str, object]:
-        """Of processes that use it."""
+        """The settings of processes that use it."""
         return {
             "storage_url": f"s3://{self._bucket}/all",
             "storage_endpoint": f"http://127.0.0.1:{self._relay_port}",
@@ -99,12 +99,12 @@ class ObjectStore:
         }
 
     def keys(self) -> set[str]:
-        """Of all files."""
+        """The keys of all files."""
         pages = self._client().get_paginator("list_objects_v2").paginate(Bucket=self._bucket, Prefix="all/")
         return {item["Key"].removeprefix("all/") for page in pages for item in page.get("Contents", ())}
 
     async def refuse(self, seconds: float) -> None:
-        """Connections break, and no new one is served."""
+        """Break connections, and serve no new one."""
         self._away = True
         for writer in list(self._open):
             writer.transport.abort()
@@ -112,7 +112,7 @@ class ObjectStore:
         self._away = False
 
     async def fall_silent(self, seconds: float) -> None:
-        """Connections stay, and no answer comes."""
+        """Keep connections open, but do not answer."""
         self._process.send_signal(signal.SIGSTOP)
         await asyncio.sleep(seconds)
         self._process.send_signal(signal.SIGCONT)
@@ -152,7 +152,7 @@ async def _pump(source: asyncio.StreamReader, sink: asyncio.StreamWriter) -> Non
 
 
 class WrongClock:
-    """The wall clock of one worker and its jobs, as a file says; changes are seen within a second."""
+    """The wall clock of one worker and its jobs, set by a file; changes take effect within a second."""
 
     def __init__(self, folder: Path) -> None:
         self._file, self._library = folder / "clock", folder / "wrong_clock.so"
@@ -161,19 +161,19 @@ class WrongClock:
         self.jump(0)
 
     def jump(self, seconds: int) -> None:
-        """To so far from the right time."""
+        """Set the offset from the true time."""
         fresh = self._file.with_suffix(".new")
         fresh.write_text(f"{seconds}\n")
         fresh.rename(self._file)
 
     def variables(self) -> dict[str, str]:
-        """Of the process whose clock it is."""
+        """The environment variables of a process with this clock."""
         return {"LD_PRELOAD": str(self._library), "WRONG_CLOCK_FILE": str(self._file)}
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """All of them."""
+    """Everything that a storm with real jobs can break."""
 
     disk: SmallDisk
     store: ObjectStore

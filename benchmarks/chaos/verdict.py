@@ -1,4 +1,4 @@
-"""What has to hold when the storm is over."""
+"""The claims that must hold after the storm."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from benchmarks.chaos.installation import Installation
 from workers.database.database import Database
 from workers.records import shown_key
 
-# A start that was under way when the job ended may still say so.
+# A start that was under way when the job ended may still be reported.
 START_S = 5.0
 STORES_OWN = {"health", "store-id"}
 
 
 @dataclass(frozen=True)
 class Claim:
-    """One thing that has to hold; ``broken`` says where it does not."""
+    """One thing that must hold; ``broken`` lists where it does not."""
 
     name: str
     broken: list[str]
 
 
 def claims_about_jobs(clients: Clients) -> list[Claim]:
-    """What the clients saw."""
+    """Claims about what the clients saw."""
     wrong = [
         f"{seen.job['id']} ({seen.kind}, {seen.state_at_cancel} at its cancel) is {seen.job['state']}:"
         f" {seen.job.get('error')}"
@@ -81,7 +81,7 @@ def _late_starts(seen: Seen) -> list[str]:
 
 
 async def claims_about_rest(installation: Installation, database: Database, patience_s: float) -> list[Claim]:
-    """Once the janitor had time to tidy up: what is left in tables, store and folders."""
+    """Claims about what is left in tables, store and folders, once the janitor has had time to clean up."""
     end = time.monotonic() + patience_s
     while True:
         claims = [
@@ -110,7 +110,7 @@ async def _store(installation: Installation, database: Database) -> list[str]:
     rows = await database.fetch("SELECT key FROM dataset_files UNION SELECT key FROM job_file_keys")
     known = {row["key"] for row in rows}
     checked = await database.fetch("SELECT id FROM datasets WHERE state = 'ready'")
-    # What pages show of a set that passed its check, each file of it or none.
+    # What pages show of a checked set: all of its files or none.
     shown = tuple(f"{shown_key(row['id'])}/" for row in checked)
     lost = [f"lost: {key}" for key in sorted(known - there)]
     return lost + [f"nobody's: {key}" for key in sorted(there - known) if not key.startswith(shown)]
@@ -123,7 +123,7 @@ def _scratch(installation: Installation) -> list[str]:
 
 
 def told(claims: list[Claim], faults: Counter[str], answers: Counter[int | str], seconds: float) -> str:
-    """The verdict for people."""
+    """The verdict as text."""
     lines = [f"{sum(faults.values())} faults in {seconds:.0f} s: {dict(sorted(faults.items()))}"]
     lines.append(f"answers: {dict(sorted(answers.items(), key=str))}")
     for claim in claims:

@@ -1,1 +1,1 @@
-"""Sets of photos as their owners published them: what the product makes of each."""
+"""The product's results on photo sets as their owners published them."""

@@ -1,8 +1,8 @@
 """`make field-check`: the product on sets as their owners published them; ``python -m benchmarks.field [SET...]``.
 
-BIRESNERF_FIELD_DATA is the folder of clones, where all results go too; what it lacks is cloned from GitHub. Each set
+BIRESNERF_FIELD_DATA is the folder of clones and results; missing clones are fetched from GitHub. Each set
 goes through COLMAP with its own defaults, then through `refine` as photos alone and with noisy poses, and with --url
-through a service. Prints a JSON line for each set, then a table of all that were ever run in that folder.
+through a service. Prints a JSON line for each set, then a table of all sets that were ever run in that folder.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""COLMAP on a set, in a process of its own: ``python -m benchmarks.field.colmap_child REQUEST.json``.
+"""COLMAP on a set, in a separate process: ``python -m benchmarks.field.colmap_child REQUEST.json``.
 
-`place` maps the photos twice from one set of matches: COLMAP as it comes, and with richer lenses, whose model stands in
-for the truth where there is none. `measure` asks the matches about any model. Both of COLMAP's were fitted to them.
+`place` maps the photos twice from the same matches: with COLMAP's defaults, and with richer lenses, whose model stands
+in for a missing truth. `measure` tests any model against the matches, to which both of COLMAP's were fitted.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def _mapped(database: Path, root: Path, folder: Path) -> dict[str, Any]:
 
 
 def _widen_lenses(database: Path, peer: Path) -> None:
-    """Makes the database's cameras OPENCV ones, with the focal length and first distortion term of the peer's."""
+    """Converts the database's cameras to OPENCV, with the peer's focal length and first distortion term."""
     import pycolmap
 
     found = pycolmap.Reconstruction(peer / "best").cameras

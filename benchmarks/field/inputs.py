@@ -1,4 +1,4 @@
-"""What the product is given of a set: its photos alone, or the same with noisy poses; and where GPS says they lie."""
+"""The product's inputs from a set: photos alone, or with noisy poses; and the photos' GPS positions."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def with_poses(folder: Path, frames: list[dict[str, Any]], *, noise: float) -> P
 
 
 def lens(frame: dict[str, Any]) -> dict[str, Any]:
-    """An OPENCV lens in a transforms.json's words."""
+    """An OPENCV lens as keys of transforms.json."""
     keys = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
     full = _camera(frame).full()
     params = (full.fx, full.fy, full.cx, full.cy, full.k1, full.k2, full.p1, full.p2)
@@ -55,26 +55,26 @@ def lens(frame: dict[str, Any]) -> dict[str, Any]:
 
 
 def lenses_are_real(frames: list[dict[str, Any]]) -> bool:
-    """Whether every pixel has a viewing ray: of few photos COLMAP finds lenses that fold."""
+    """Whether every pixel has a viewing ray: from few photos, COLMAP may find lenses that fold."""
     cameras = (_camera(frame) for frame in frames)
     return all(lens_problem(c.full(), c.width, c.height) is None for c in cameras)
 
 
 def _camera(frame: dict[str, Any]) -> Camera:
-    """Of COLMAP's SIMPLE_RADIAL or OPENCV."""
+    """The camera of COLMAP's SIMPLE_RADIAL or OPENCV lens."""
     found = frame["lens"]
     return Camera(found["model"], found["width"], found["height"], tuple(found["params"]))
 
 
 def gps_places(source: Path, names: tuple[str, ...]) -> dict[str, Array]:
-    """Metres along east, north and up from the first, by file name; of the photos that say."""
+    """GPS positions in metres east, north and up from the first, by file name; only of photos that have one."""
     tags = {Path(name).name: read_geotag(source / name, name) for name in names}
     known = {name: tag.place for name, tag in tags.items() if tag is not None}
     return {name: metres_from(next(iter(known.values())), place) for name, place in known.items()}
 
 
 def metres_from(origin: tuple[float, float, float], place: tuple[float, float, float]) -> Array:
-    """Of latitude and longitude (degrees) and height (m), over a few hundred metres, where the earth is flat."""
+    """East, north and up (m) from latitude, longitude (degrees) and height (m); flat earth, a few hundred metres."""
     north, east = np.radians(place[0] - origin[0]), np.radians(place[1] - origin[1])
     return np.array(
         [east * np.cos(np.radians(origin[0])) * EARTH_M, north * EARTH_M, place[2] - origin[2]], dtype=np.float64
@@ -82,7 +82,7 @@ def metres_from(origin: tuple[float, float, float], place: tuple[float, float, f
 
 
 def gps_residual(poses: dict[str, Array], places: dict[str, Array]) -> float | None:
-    """Median distance (m) of the cameras from their places, after the similarity between the two; None of under six."""
+    """Median distance (m) of cameras from their GPS positions after similarity alignment; None for under six."""
     shared = sorted(poses.keys() & places.keys())
     if len(shared) < 6:
         return None

@@ -1,4 +1,4 @@
-"""One set through COLMAP and through the product, as people run them: by their commands."""
+"""Runs COLMAP and the product on one set, by their commands, as users do."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ NICE = ("nice", "-n", "10")
 
 @dataclass(frozen=True)
 class Asked:
-    """How the battery runs.
+    """The battery's settings.
 
     Attributes:
         data: the folder of clones and results.
-        photos: of a set, at most.
-        options: of the product, as on its command line.
-        url: of a service that gets the set as well.
-        runs: of `RUNS`, those that are made.
-        keep: takes the product's results that are there, in place of new ones.
+        photos: the most photos of a set.
+        options: the product's, as on its command line.
+        url: a service that gets the set as well.
+        runs: which of `RUNS` to do.
+        keep: reuses existing results of the product.
     """
 
     data: Path
@@ -55,7 +55,7 @@ class Asked:
 
 
 def run_set(field_set: FieldSet, asked: Asked) -> Row:
-    """A row of the table. COLMAP's part is done once; results lie in ``data``/work/NAME."""
+    """Returns a row of the table. COLMAP's part is done once; results are in ``data``/work/NAME."""
     source, work = lay_out(field_set, asked.data), asked.data / "work" / field_set.name
     names = field_set.photos[: asked.photos]
     colmap = _placed_by_colmap(source, names, work / "colmap")
@@ -93,11 +93,11 @@ def run_set(field_set: FieldSet, asked: Asked) -> Row:
 
 
 class Judge:
-    """Measures poses of a set against what is known of it.
+    """Measures a set's poses against what is known about it.
 
     Args:
         truth: world_from_cam [4, 4] by file name.
-        places: from GPS, by file name.
+        places: GPS positions by file name.
         matches: the folder of `colmap_child.place`.
     """
 
@@ -127,7 +127,7 @@ class Judge:
 
 
 def child(step: str, work: Path, **request: Any) -> Row:
-    """What `colmap_child` answers."""
+    """Runs a step of `colmap_child`; returns its answer."""
     path, answer = work / f"{step}.request.json", work / f"{step}.json"
     answer.unlink(missing_ok=True)
     path.write_text(json.dumps({"step": step, "work": str(work), "answer": str(answer), **request}), "utf-8")
@@ -141,7 +141,7 @@ def child(step: str, work: Path, **request: Any) -> Row:
 
 
 def _true_frames(colmap: Row) -> list[Row]:
-    """Those of COLMAP's model with richer lenses; else of its default one; none where neither can be the truth."""
+    """Frames of COLMAP's model with richer lenses, else of its default one; empty if neither can be the truth."""
     for name in ("reference", "peer"):
         frames: list[Row] = colmap.get(name, {}).get("frames", [])
         if len(frames) > 2 and lenses_are_real(frames):
@@ -165,7 +165,7 @@ def poses_of(frames: list[Row]) -> dict[str, Array]:
 
 
 def _refined(folder: Path, out: Path, asked: Asked, judge: Judge, url: str | None) -> Row:
-    """What the product makes of a folder by `refine`, or by `submit` where a service has the ``url``."""
+    """The product's result for a folder, by `refine`, or by `submit` if there is a ``url``."""
     if asked.keep and (out / "report.json").is_file():
         return _read(out, judge)
     shutil.rmtree(out, ignore_errors=True)
@@ -187,7 +187,7 @@ def _read(out: Path, judge: Judge) -> Row:
 
 
 def said(report: Row) -> Row:
-    """What a report tells the user of the poses."""
+    """What a report tells the user about the poses."""
     images = report["images"]
     known = [image for image in images if (image["uncertainty"] or {}).get("rotation_deg") is not None]
     return {

@@ -1,4 +1,4 @@
-"""The sets of the battery: where each comes from, and which of its photos are taken. The photos stay out of here."""
+"""The sets of the battery: their sources and the photos used. The photos are not in this repository."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ class FieldSet:
         name: what the table calls it.
         kind: what is photographed, and with what.
         repository: ``owner/name`` on GitHub.
-        commit: the files of this one are taken.
+        commit: the commit whose files are used.
         folder: within the repository.
         licence: of the photos, as far as it is stated.
         photos: names within the folder; a subset where the set is large.
         also: other files of it that belong to these photos, such as poses.
         owner_poses: whether these files hold poses.
-        held_back: not looked at while code is written.
+        held_back: not examined during development.
     """
 
     name: str
@@ -43,7 +43,7 @@ class FieldSet:
 
 
 def read_sets(path: Path = LIST) -> list[FieldSet]:
-    """The list, in its order. Names of photos stand in one string, with spaces between them."""
+    """The list, in its order. Names of photos are one string, separated by spaces."""
     rows: list[dict[str, Any]] = json.loads(path.read_text("utf-8"))
     split = [{key: tuple(row.get(key, "").split()) for key in ("photos", "also")} for row in rows]
     return [FieldSet(**{**row, **names}) for row, names in zip(rows, split, strict=True)]
@@ -79,7 +79,7 @@ def lay_out(field_set: FieldSet, data: Path) -> Path:
 
 
 def clone_of(field_set: FieldSet, data: Path) -> Path:
-    """The clone in ``data``, called NAME, OWNER+NAME or OWNER/NAME; else a new one from GitHub."""
+    """The clone in ``data`` named NAME, OWNER+NAME or OWNER/NAME; else a new one from GitHub."""
     owner, name = field_set.repository.split("/")
     for place in (data / f"{owner}+{name}", data / owner / name, data / name):
         if place.is_dir():

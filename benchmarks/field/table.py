@@ -33,7 +33,7 @@ def _line(row: Row) -> tuple[str, ...]:
 
 
 def _placed(run: Row | None, count: int) -> str:
-    """Photos placed, by the product those whose accuracy it states; how well matches and GPS fit; the verdict."""
+    """Photos placed, with those of stated accuracy for the product; the fit of matches and GPS; the verdict."""
     if run is None:
         return "-"
     if "error" in run:

@@ -1,1 +1,1 @@
-"""What a GPU would do, checked without one where that is possible, and measured where there is one."""
+"""Checks of the GPU code that need no GPU, and measurements that do."""

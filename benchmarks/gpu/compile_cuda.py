@@ -1,7 +1,7 @@
 """Compile every CUDA kernel for compute capabilities, without a GPU: `python -m benchmarks.gpu.compile_cuda 80 90`.
 
-The interpreter that runs the kernels in tests is more forgiving than the compiler. Prints what each kernel takes:
-shared memory, registers of a thread and what of them is spilt to the stack (bytes).
+The interpreter that runs the kernels in tests is more forgiving than the compiler. Prints each kernel's shared memory,
+registers per thread, and how much of them is spilt to the stack (bytes).
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ CAPACITIES = (Capacity(256, 1024, 768, 8), Capacity(250, 1003, 77, 1))
 
 @dataclass(frozen=True)
 class Usage:
-    """What a compiled kernel takes: shared memory (bytes); registers and stack (bytes) of a thread."""
+    """The resources of a compiled kernel: shared memory (bytes); registers and stack (bytes) per thread."""
 
     shared: int
     registers: int
@@ -69,7 +69,7 @@ def kernels() -> dict[str, Launch]:
 
 
 def cameras() -> Iterator[Launch]:
-    """The kernels of viewing directions, poses and rays, for counts that 16 divides and others."""
+    """The kernels of viewing directions, poses and rays, for counts divisible by 16 and others."""
     matrices, vectors = torch.zeros(1, 3, 4), torch.zeros(1, 3)
     poses = {"matrices": matrices, "g_matrices": matrices, "start": matrices, "length": torch.zeros(1)}
     rays = dict.fromkeys(("origin", "direction", "g_origin", "g_direction", "in_cam"), vectors)
@@ -94,9 +94,9 @@ def _add(found: dict[str, Launch], launches: Iterable[Launch]) -> None:
 
 
 def _specialised(launch: Launch) -> tuple[dict[str, Any], dict[str, str], dict[tuple[int], Any]]:
-    """Constants, types and what is known of the arguments, as a launch would tell the compiler.
+    """Constants, types and specialisations of the arguments, as a launch would pass them to the compiler.
 
-    Triton does so by the values: a pointer or number that 16 divides, and the number one.
+    Triton specialises by value: a pointer or number divisible by 16, and the number one.
     """
     constants: dict[str, Any] = {}
     signature: dict[str, str] = {}
@@ -108,7 +108,7 @@ def _specialised(launch: Launch) -> tuple[dict[str, Any], dict[str, str], dict[t
             continue
         tensor = isinstance(value, torch.Tensor)
         signature[parameter.name] = POINTERS[value.dtype] if tensor else "i32"
-        # The allocator aligns what it gives; a slice begins where it begins.
+        # The allocator aligns its memory; slices may begin anywhere.
         begins = value.storage_offset() * value.element_size() if tensor else value
         if begins % ALIGNED == 0:
             attributes[(i,)] = [["tt.divisibility", ALIGNED]]
@@ -116,7 +116,7 @@ def _specialised(launch: Launch) -> tuple[dict[str, Any], dict[str, str], dict[t
 
 
 def compiled(launch: Launch, capability: int) -> Usage:
-    """What a kernel takes, compiled for a compute capability."""
+    """The resources of a kernel, compiled for a compute capability."""
     constants, signature, attributes = _specialised(launch)
     found = triton.compile(
         ASTSource(launch.kernel, signature=signature, constexprs=constants, attrs=attributes),

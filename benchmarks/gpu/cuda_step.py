@@ -1,7 +1,7 @@
 """One optimisation step of the field on a GPU: the Triton kernels against the plain-torch definition.
 
 ``python -m benchmarks.gpu.cuda_step`` prints a JSON line for each stage; with ``--profile``, where a step's time goes;
-with ``--waiting``, the kernel that faults, as the host waits for each one.
+with ``--waiting``, the host waits for each kernel, which shows the one that fails.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ def _rays(count: int) -> Rays:
 
 
 def _shell() -> torch.Tensor:
-    """Live in a spherical shell: about 40 samples a ray, as after pruning."""
+    """An occupancy grid that is live in a spherical shell: about 40 samples a ray, as after pruning."""
     centre = (torch.arange(SIDE, device=DEVICE) + 0.5) / SIDE - 0.5
     z, y, x = torch.meshgrid(centre, centre, centre, indexing="ij")
     return (((x * x + y * y + z * z).sqrt() - 0.33).abs() < 0.02).to(torch.uint8)
 
 
 def _steps(field: RadianceField, rays: int, steps: int, occupied: torch.Tensor) -> tuple[float, int]:
-    """Seconds a step, with the host free to run ahead as it is in a run, and samples of the last."""
+    """Seconds per step, with the host free to run ahead as in a run, and the samples of the last step."""
     batch, marching, samples = _rays(rays), Marching(3.3e-3, 0.1, 12.0, 768, occupied), 0
     torch.cuda.synchronize()
     started = time.perf_counter()
@@ -65,7 +65,7 @@ def _steps(field: RadianceField, rays: int, steps: int, occupied: torch.Tensor) 
 
 
 def run(rays: int, rounds: int) -> Iterator[dict[str, float | str | int]]:
-    """A row for stage 1 and stage 2 at the paper's encodings (Table 1), T = 2^19: medians, in turn."""
+    """A row for each stage at the paper's encodings (Table 1), T = 2^19: medians, measured alternately."""
     shape = FieldShape(grid_levels(3, 16, 72, 22), grid_levels(LEVELS, 128, 4096, 19), unbounded=False)
     kernels, plain = CudaField(shape, 0, DEVICE), ReferenceField(shape, 0, DEVICE)
     occupied = _shell()
@@ -89,7 +89,7 @@ def run(rays: int, rounds: int) -> Iterator[dict[str, float | str | int]]:
 
 
 def wait_for_each_launch() -> None:
-    """Let a fault show at the kernel that has it. Nothing is recorded as a graph."""
+    """Wait after each launch, so that a fault shows at its kernel. Records no graphs."""
     launch_alone = Launch.__call__
 
     def launch_and_wait(launch: Launch) -> None:
@@ -109,7 +109,7 @@ def wait_for_each_launch() -> None:
 
 
 def profile(rays: int) -> str:
-    """Kernels of stage 2 by their time on the device, as torch's profiler sees 20 steps."""
+    """The kernels of stage 2 by device time, from torch's profiler over 20 steps."""
     from torch.profiler import ProfilerActivity
     from torch.profiler import profile as watch
 

@@ -1,4 +1,4 @@
-"""What a step of the joint optimisation asks of a GPU outside of the field's kernels: launches, and no waiting.
+"""A joint optimisation step's GPU operations outside the field's kernels: counts launches, finds waits.
 
 The step runs on torch's "meta" device in place of a GPU: its tensors have shapes but no values. Whatever needs a value
 on the host would wait for a GPU, and raises here; what moves values between host and device is listed.
@@ -45,7 +45,7 @@ _ADAM.impl("_fused_adam_.tensor_lr", lambda *arguments, **others: None)
 
 @dataclass
 class Trace:
-    """What a step asks of the device outside of the field.
+    """A step's device operations outside of the field.
 
     Attributes:
         launches: operations by name, views and empty buffers left out.
@@ -99,22 +99,22 @@ class PretendedGenerator:
 
 
 class PretendedMetrics:
-    """In place of the copy that runs beside the next step (`AsyncMetrics`)."""
+    """Replaces the copy that runs beside the next step (`AsyncMetrics`)."""
 
     def read(self, *metrics: Tensor) -> list[float]:
         return [0.0] * len(metrics)
 
 
 def pretended_directions(lenses: Intrinsics, image: Tensor, xy: Tensor) -> Tensor:
-    """In place of the kernel that finds viewing directions (`cuda/cameras/lens.py`)."""
+    """Replaces the kernel that finds viewing directions (`cuda/cameras/lens.py`)."""
     return torch.cat([xy.double() / lenses.fx[image, None], torch.ones_like(xy[:, :1])], 1)
 
 
 def traced_step(optimiser: JointOptimiser, *, looks_at_cells: bool = False) -> Trace:
-    """What a step asks for, after the one before it, which puts constants there.
+    """The operations of a step, traced after a first one that moves constants to the device.
 
     Args:
-        looks_at_cells: whether it is one of those that update the occupancy grid.
+        looks_at_cells: trace a step that updates the occupancy grid.
     """
     recorder = Recorder()
     made = _on_pretended_gpu(optimiser)
@@ -168,7 +168,7 @@ def _tensors(value: object) -> Iterator[Tensor]:
 
 
 def _line() -> str:
-    """The line of the library that asks for an operation; the way back has none but that which starts it."""
+    """The library's line that requests an operation; for the backward pass, the line that starts it."""
     frame = sys._getframe()
     while frame.f_back and not frame.f_code.co_filename.startswith(LIBRARY):
         frame = frame.f_back

@@ -1,8 +1,8 @@
-"""All that a machine with a GPU can tell of the CUDA backend, in one file: ``python -m benchmarks.gpu.report``.
+"""A full report on the CUDA backend from a machine with a GPU, in one file: ``python -m benchmarks.gpu.report``.
 
-Runs from a plain checkout; nothing has to be installed but torch, Triton, Numba and NumPy. What else is missing is
-named, and found in ``--wheels FOLDER``, which ``--gather FOLDER`` fills on a machine with a network. Each part is a
-process with a limit; whatever happens to it, the next one follows, and the file is written as it goes. In this order:
+Runs from a plain checkout; only torch, Triton, Numba and NumPy must be installed. Other missing packages are named, and
+taken from ``--wheels FOLDER``, which ``--gather FOLDER`` fills on a machine with a network. Each part is a process with
+a time limit; if it fails, the next one follows. The file is written progressively. The parts, in order:
 
 machine, kernels against the definition, ms a step of the field against plain torch and of the whole optimisation, whole
 runs of each SET and a made scene with noisy poses in each preset, a profile of the kernels, and the tests that need a
@@ -70,7 +70,7 @@ class Part:
 
 
 def parts(asked: argparse.Namespace, work: Path) -> Iterator[Part]:
-    """What is run, in this order."""
+    """The parts, in order."""
     python, scene = (sys.executable, "-m"), work / "made"
     biresnerf = (*python, "biresnerf.command_line")
     settings = tuple(
@@ -90,13 +90,13 @@ def parts(asked: argparse.Namespace, work: Path) -> Iterator[Part]:
             yield Part("runs", run, asked.run_limit)
     if asked.device == "cuda":
         yield Part("profile", (*python, "benchmarks.gpu.cuda_step", "--profile"), 300)
-        # Without the project's settings, which want plugins that these tests do not need.
+        # Without the project's settings, which require plugins that these tests do not need.
         alone = ("-c", os.devnull, "--rootdir", str(ROOT), "-p", "no:cacheprovider")
         yield Part("tests", (*python, "pytest", "-v", "--tb=short", *alone, *GPU_TESTS), 600)
 
 
 def missing() -> list[str]:
-    """Packages that this Python lacks."""
+    """The required packages that this Python lacks."""
     return [
         package
         for module, packages in NEEDED.items()
@@ -106,7 +106,7 @@ def missing() -> list[str]:
 
 
 def gather(folder: Path, python: str, only: list[str]) -> None:
-    """Fill a folder with wheels, of some packages or all, for another Linux machine with that Python."""
+    """Fill a folder with wheels of all or some packages, for another Linux machine with this Python version."""
     target = (
         "--python-version",
         python,
@@ -122,7 +122,7 @@ def gather(folder: Path, python: str, only: list[str]) -> None:
 
 
 def environment(asked: argparse.Namespace, work: Path) -> dict[str, str]:
-    """That of the parts: the checkout, then what the wheels hold."""
+    """The parts' environment: the checkout comes first on the path, then the wheels' packages."""
     unpacked = work / "packages"
     for wheel in sorted(asked.wheels.glob("*.whl")) if asked.wheels else ():
         with zipfile.ZipFile(wheel) as archive:
@@ -133,7 +133,7 @@ def environment(asked: argparse.Namespace, work: Path) -> dict[str, str]:
 
 
 def run(part: Part, variables: dict[str, str], report: TextIO) -> str:
-    """How a part ended; what it prints is in the report at once, whatever becomes of this process."""
+    """Run a part; returns how it ended. Its output goes to the report at once, even if this process dies."""
     try:
         done = subprocess.run(
             part.command,

@@ -1,8 +1,8 @@
 """One step of the whole optimisation on a GPU, photos to poses, and where its time goes.
 
-``python -m benchmarks.gpu.whole_step`` prints a JSON line for each preset and stage; with ``--profile`` the operations
-of a step that take the device and the host longest. Where the host does not wait (``cudaEventSynchronize``), launches
-cost more than what they do.
+``python -m benchmarks.gpu.whole_step`` prints a JSON line for each preset and stage; with ``--profile``, the operations
+of a step that take the device and the host longest. If the host never waits (``cudaEventSynchronize``), launches cost
+more than the work itself.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def wait_for(device: torch.device) -> None:
 
 
 def row(preset: str, stage: str, joint: JointOptimiser) -> dict[str, float | str]:
-    """Medians would hide the updates of the occupancy grid, so these are means."""
+    """A row of means: medians would hide the updates of the occupancy grid."""
     wait_for(joint.device)
     began, rays, samples = time.perf_counter(), 0, 0
     for _ in range(TIMED):
@@ -59,7 +59,7 @@ def row(preset: str, stage: str, joint: JointOptimiser) -> dict[str, float | str
 
 
 def profile(joint: JointOptimiser) -> str:
-    """What a step's operations take of the device and of the host, as torch's profiler sees them."""
+    """Device and host times of a step's operations, from torch's profiler."""
     from torch.profiler import ProfilerActivity
     from torch.profiler import profile as watch
 

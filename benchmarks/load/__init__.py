@@ -1,4 +1,4 @@
-"""How fast and how large: a full queue, many uploads, many listeners, an hour of requests.
+"""Speed and memory under load: a full queue, many uploads, many listeners, an hour of requests.
 
 ``python -m benchmarks.load`` prints a table and writes it as JSON.
 """

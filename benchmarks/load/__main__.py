@@ -81,7 +81,7 @@ async def ready(calls: Calls) -> None:
 
 
 async def start_workers(installation: Installation, count: int) -> None:
-    """Workers beside the API that runs already."""
+    """Start workers beside the running API."""
     for n in range(count):
         installation.add(Kept(f"worker{n}", (sys.executable, "-m", "workers.queue.slot", "--slot", f"w{n}")))
     await asyncio.sleep(3.0)

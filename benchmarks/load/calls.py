@@ -1,4 +1,4 @@
-"""Calls to one API process, timed by endpoint; and how much memory and CPU time that process has."""
+"""Calls to one API process, timed by endpoint; and that process's memory and CPU time."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Calls:
         self.refused: list[str] = []
 
     async def __call__(self, name: str, method: str, path: str, **request: Any) -> httpx.Response:
-        """One timed call; an answer of 400 or more is noted."""
+        """One timed call; records answers of 400 or more."""
         began = time.perf_counter()
         answer = await self.http.request(method, path, **request)
         self.took[name].append(time.perf_counter() - began)
@@ -42,7 +42,7 @@ class Calls:
 
 
 def spread(seconds: list[float]) -> dict[str, float]:
-    """How many, and p50, p99 and the longest in milliseconds."""
+    """The count, and p50, p99 and maximum in milliseconds."""
     ordered = sorted(seconds)
     p99 = ordered[min(len(ordered) - 1, round(0.99 * len(ordered)))]
     return {
@@ -54,7 +54,7 @@ def spread(seconds: list[float]) -> dict[str, float]:
 
 
 async def at_once(width: int, work: Iterable[Callable[[], Awaitable[Any]]]) -> float:
-    """Do all of it, ``width`` at a time; returns the seconds it took."""
+    """Do all the work, ``width`` at a time; returns the seconds it took."""
     began, queue = time.perf_counter(), iter(list(work))
 
     async def one() -> None:

@@ -34,7 +34,7 @@ async def ready_dataset(calls: Calls) -> str:
 
 
 async def fill(database: Database, dataset: str, count: int, first: int = 0) -> None:
-    """Jobs that wait already, older than all others, straight into the tables: numbers ``first`` to ``count``."""
+    """Insert waiting jobs, numbers ``first`` to ``count``, into the tables; they are older than all others."""
     options = Jsonb({"preset": "fast"})
     for begin in range(first, count, 1000):
         async with database.transaction() as connection:
@@ -48,12 +48,12 @@ async def fill(database: Database, dataset: str, count: int, first: int = 0) -> 
                 )
     async with database.pool.connection() as connection:
         await connection.set_autocommit(True)
-        await connection.execute("VACUUM ANALYZE")  # as it would be after a while
+        await connection.execute("VACUUM ANALYZE")  # as autovacuum would after a while
         await connection.set_autocommit(False)
 
 
 async def enqueue(calls: Calls, process: Process, stores: Stores, dataset: str, count: int) -> Figures:
-    """``count`` jobs over HTTP and as many by the library."""
+    """Submit ``count`` jobs over HTTP and as many through the library."""
     body, options = {"dataset_id": dataset, "options": OPTIONS}, RefineOptions(preset="fast")
     cpu = process.cpu_s()
     http_s = await at_once(
@@ -69,7 +69,7 @@ async def enqueue(calls: Calls, process: Process, stores: Stores, dataset: str, 
 
 
 async def lists(calls: Calls, total: int) -> Figures:
-    """Page through all, by two filters, and look at single jobs."""
+    """Page through all jobs, by two filters, and read single jobs."""
     seen: list[str] = []
     for query, name in (("", "listJobs, 200 of all"), ("&state=queued", "listJobs, 200 of the queued")):
         cursor, found = "", []
@@ -92,7 +92,7 @@ async def lists(calls: Calls, total: int) -> Figures:
 
 
 async def uploads(calls: Calls, process: Process, count: int, mib: int) -> Figures:
-    """``count`` files at the same time, each into a dataset of its own."""
+    """Upload ``count`` files at the same time, each into its own dataset."""
     made = [await calls("createDataset", "POST", "/v1/datasets", json={"name": "load"}) for _ in range(count)]
     content, before, highest = os.urandom(2**20 * mib), process.mib(), [process.mib()]
 
@@ -133,7 +133,7 @@ async def listeners(
 
     async def listen(n: int, job: str) -> None:
         nonlocal refused
-        while not await listened(n, job):  # as the answer, 503, asks for
+        while not await listened(n, job):  # as the 503's Retry-After requests
             refused += 1
             await asyncio.sleep(1.0)
 
@@ -188,7 +188,7 @@ async def listeners(
 
 
 async def _change(database: Database, jobs: list[str], seconds: float) -> dict[tuple[str, int], float]:
-    """Each job once a second; when each of its events was about to be written."""
+    """Change each job once a second; returns when each of its events was about to be written."""
     sent: dict[tuple[str, int], float] = {}
     began = time.perf_counter()
     while time.perf_counter() - began < seconds:
@@ -209,7 +209,7 @@ async def _poll_jobs(calls: Calls, jobs: list[str]) -> None:
 async def an_hour(
     calls: Calls, process: Process, jobs: list[str], dataset: str, requests: int, seconds: float
 ) -> Figures:
-    """As many requests as a busy hour has, of every kind, as fast as they go or within `seconds`; memory meanwhile."""
+    """A busy hour's requests of all kinds, as fast as possible or within `seconds`; measures memory meanwhile."""
     chance, memory = random.Random(2), [process.mib()]
 
     async def one() -> None:
@@ -253,7 +253,7 @@ async def an_hour(
 
 
 async def dispatch(calls: Calls, dataset: str, count: int) -> Figures:
-    """From submit to success of jobs that do nothing, through all workers there are."""
+    """Time from submission to success of empty jobs, through all workers."""
     body = {"dataset_id": dataset, "options": OPTIONS}
     jobs = [(await calls("submitJob", "POST", "/v1/jobs", json=body)).json()["id"] for _ in range(count)]
     ends = [(await calls.http.get(f"/v1/jobs/{jobs[0]}?wait=60")).json()]

@@ -1,1 +1,1 @@
-"""How well poses are found: seeding, lenses and the verdict's trainings."""
+"""The quality of the method: seeding, lenses, and the verdict's trainings."""

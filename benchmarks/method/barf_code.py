@@ -1,9 +1,9 @@
-"""BARF's own code as a check of ours: ``python -m benchmarks.method.barf_code CHECKOUT SET``.
+"""Checks our code against BARF's: ``python -m benchmarks.method.barf_code CHECKOUT SET``.
 
-CHECKOUT is a clone of https://github.com/chenhsuanlin/bundle-adjusting-NeRF. Its network gets our weights, its cameras
-our noisy poses, and its renderer the same pixels and depths of SET. Prints the largest differences of colours, and of
-gradients of the loss by poses and weights, relative to the largest value, at four points of the run. `rounding` is what
-the poses' gradient changes by if all cameras of ours move by one part in ten million of their distance.
+CHECKOUT is a clone of https://github.com/chenhsuanlin/bundle-adjusting-NeRF. It gets our weights and noisy poses, and
+the same pixels and depths of SET. Prints the largest differences of colours, and of gradients of the loss by poses and
+weights, relative to the largest value, at four points of the run. `rounding` is that of our poses' gradient if all
+cameras move by a ten-millionth of their distance.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ ROUNDING = 1e-7  # what float32 does to positions
 
 
 def published_code(checkout: Path) -> tuple[ModuleType, ModuleType]:
-    """Its modules `model.barf` and `camera`."""
+    """The published modules `model.barf` and `camera`."""
     for name in UNUSED:
         sys.modules[name] = MagicMock()
     sys.path.insert(0, str(checkout))
@@ -53,7 +53,7 @@ def published_code(checkout: Path) -> tuple[ModuleType, ModuleType]:
 
 
 def published_options() -> Any:
-    """Its options of the Blender scenes (options/nerf_blender.yaml, barf_blender.yaml), of the network and renderer."""
+    """The published options for Blender scenes (options/nerf_blender.yaml, barf_blender.yaml): network and renderer."""
     return SimpleNamespace(
         device="cpu",
         arch=SimpleNamespace(
@@ -97,7 +97,7 @@ def ours(optimiser: JointOptimiser, image: Tensor, xy: Tensor, photo: Tensor) ->
 def theirs(
     barf: ModuleType, camera: ModuleType, optimiser: JointOptimiser, image: Tensor, xy: Tensor, photo: Tensor
 ) -> dict[str, Tensor]:
-    """The same by the published code."""
+    """The same from the published code."""
     options, field = published_options(), optimiser.field
     assert isinstance(field, MlpField)
     network = barf.NeRF(options)

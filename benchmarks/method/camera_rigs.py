@@ -1,4 +1,4 @@
-"""Cameras that see what is near them, and what they observe, with the exact truth: for `many_cameras`."""
+"""Cameras that see nearby surfaces, with their observations and the exact truth: for `many_cameras`."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ OFF_RAD, OFF = 0.005, 0.03  # of each given pose, each axis
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Cameras, where they truly are [n, 4, 4] and where they are given to be, and what they observe."""
+    """Cameras with their true poses [n, 4, 4], their given poses, and their observations."""
 
     truth: Array
     given: Array
@@ -44,7 +44,7 @@ class Rig:
 
 
 def rig(shape: str, count: int, seed: int = 0) -> Rig:
-    """Of so many cameras around a ring, along a corridor's wall, or in a flight's lines."""
+    """A rig of ``count`` cameras around a ring, along a corridor's wall, or in a flight's lines."""
     rng = np.random.default_rng(seed)
     truth, points, near = {"ring": _ring, "corridor": _corridor, "aerial": _aerial}[shape](count, rng)
     truth[:, :3, :3] = truth[:, :3, :3] @ _turns(rng, count, 0.05)
@@ -57,7 +57,7 @@ def rig(shape: str, count: int, seed: int = 0) -> Rig:
 
 
 def _ring(count: int, rng: np.random.Generator) -> tuple[Array, Array, Array]:
-    """Around a cylinder, looking at its axis."""
+    """Cameras around a cylinder, looking at its axis."""
     radius = max(count * ALONG / (2 * np.pi), AWAY + 1)
     angle = 2 * np.pi * np.arange(count) / count
     out = np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], 1)
@@ -69,7 +69,7 @@ def _ring(count: int, rng: np.random.Generator) -> tuple[Array, Array, Array]:
 
 
 def _corridor(count: int, rng: np.random.Generator) -> tuple[Array, Array, Array]:
-    """Along a wall, looking at it."""
+    """Cameras along a wall, looking at it."""
     length = count * ALONG
     along, none = np.arange(count) * ALONG, np.zeros(count)
     x = rng.uniform(-1, length + 1, _points(length))
@@ -83,7 +83,7 @@ def _corridor(count: int, rng: np.random.Generator) -> tuple[Array, Array, Array
 
 
 def _aerial(count: int, rng: np.random.Generator) -> tuple[Array, Array, Array]:
-    """Lines of a flight over land, looking down."""
+    """Cameras on a flight's lines over land, looking down."""
     lines = max(1, round((count * 2 * ALONG / ACROSS) ** 0.5))
     number = np.arange(count)
     line = number * lines // count
@@ -120,7 +120,7 @@ def _looking(centres: Array, forward: Array) -> Array:
 def _observed(
     truth: Array, points: Array, near: Array, intrinsics: Intrinsics, rng: np.random.Generator
 ) -> Tracks:
-    """Tracks of points by the cameras whose photos show them, of those within three of a place `near` [p, 3]."""
+    """Tracks of points in the photos that show them, from cameras within three units of a place `near` [p, 3]."""
     pairs = []
     for image, pose in enumerate(truth):
         close = np.flatnonzero(((near - pose[:3, 3]) ** 2).sum(1) < 9)

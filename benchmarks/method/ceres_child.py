@@ -1,4 +1,4 @@
-"""Rigs of `camera_rigs` adjusted by Ceres through pycolmap, with six-dimensional priors of poses through pyceres."""
+"""Adjusts rigs of `camera_rigs` with Ceres through pycolmap, with 6-D pose priors through pyceres."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 def adjusted(given: Rig) -> Array:
-    """Poses [n, 4, 4] (world from cam). The noise is measured as ours is, from outside, and Ceres run again."""
+    """Poses [n, 4, 4] (world from cam). The noise is measured outside of Ceres, as ours is, and Ceres run again."""
     poses, noise = given.given, 0.0
     for _ in range(ROUNDS):
         term = _settled(given, poses)
@@ -29,7 +29,7 @@ def adjusted(given: Rig) -> Array:
 
 
 def _round(given: Rig, poses: Array, term: TrackTerm) -> Array:
-    import pyceres  # before pycolmap: it knows the types of Ceres
+    import pyceres  # before pycolmap, whose types of Ceres it defines
     import pycolmap
     import pycolmap.cost_functions
 
@@ -56,7 +56,7 @@ def _round(given: Rig, poses: Array, term: TrackTerm) -> Array:
 
 
 def _settled(given: Rig, poses: Array) -> TrackTerm:
-    """Points where they fit best, and the noise."""
+    """The best-fitting points, and the noise."""
     cameras, tracks = Cameras.of(poses), given.evidence.tracks
     assert tracks is not None
     term = TrackTerm(tracks, given.evidence.intrinsics, cameras)

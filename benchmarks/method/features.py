@@ -1,10 +1,10 @@
 """Which features place cameras best: ``python -m benchmarks.method.features SET... [--size 200] [--widest 1600,3200]``.
 
 Each SET holds true poses, which get BARF's noise (0.15). Features are found with and without affine shapes and pooled
-scales, in photos shrunk to several sizes, up to several numbers, and so many of each photo's pairs are matched, the
-likeliest. Prints a JSON line for each: the seconds of seeding and the highest memory of any COLMAP so far (MiB), how
-many cameras COLMAP placed and their errors, and those of all cameras adjusted to the tracks from the truth: rotation
-(deg) and centre (% of the cameras' distance) after alignment.
+scales, at several photo sizes and limits of their number; several numbers of each photo's likeliest pairs are matched.
+Prints a JSON line for each: the seconds of seeding, the peak memory of any COLMAP so far (MiB), the number of cameras
+that COLMAP placed and their errors, and the errors of all cameras adjusted to the tracks from the truth: rotation (deg)
+and centre (% of the cameras' distance) after alignment.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""Whether results keep their word: ``python -m benchmarks.method.honesty SET...``.
+"""Tests whether reports are honest: ``python -m benchmarks.method.honesty SET...``.
 
 Each SET holds true poses. It is refined from eleven kinds of input (`STARTS`). Two things must never happen: the
-verdict ``improved`` where the true error of the placed cameras rose, and a camera beyond 5 degrees that the report does
-not name. Prints a JSON line for each run, and the counts at the end.
+verdict ``improved`` although the placed cameras' true error rose, and a camera more than 5 degrees off that the report
+does not name. Prints a JSON line for each run, and the counts at the end.
 
 Photos are at most 400 px for feature matching and 100 px for the field, every few views of large sets, so that a run
-takes about a minute of one core. With ``--set start=given`` there are no matches, and photos judge alone.
+takes about a minute of one core. With ``--set start=given`` there are no matches, so photos alone judge.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def named(image: ImageReport) -> bool:
 
 
 def given_set(truth: Dataset, start: str, seed: int, others: Dataset) -> Dataset:
-    """The input that is refined: the truth with something wrong."""
+    """The input to refine: the truth with an error."""
     poses = truth.world_from_cam
     if start == "true":
         return truth
@@ -123,9 +123,9 @@ def with_foreign_photos(dataset: Dataset, others: Dataset) -> Dataset:
 
 
 def match_wrongly(given: Dataset, output: Path, share: float, seed: int) -> None:
-    """Leave COLMAP's answer where a run of the set finds it, with this share of the observations at random places.
+    """Store COLMAP's answer where a run of the set finds it, with this share of wrong observations.
 
-    These are the places of other observations.
+    They have the positions of other observations.
     """
     matched = without_copies(given, ())
     seed_poses(matched, seed=seed, remember=output / SEEDING)
@@ -146,7 +146,7 @@ def errors_deg(poses: Array, truth: Array, placed: NDArray[np.bool_]) -> Array:
 
 
 def judged(truth: Dataset, report: Report, before: Array, result: Array, refined: Array) -> dict[str, object]:
-    """What was true and what was said of one run that returned some poses, refined ones or those before."""
+    """The truth and the report about one run that returned poses, refined or given ones."""
     poses, count = truth.world_from_cam, len(truth)
     placed = np.array([image.pose_source not in GUESSES for image in report.images[:count]])
     before, after, found = (errors_deg(each[:count], poses, placed) for each in (before, result, refined))
@@ -196,7 +196,7 @@ def run(
 
 
 def poses_in(folder: Path, report: Report) -> tuple[Array, Array]:
-    """Before and after, each [n, 4, 4], in the order of the report's images; after, where there was none before."""
+    """Poses before and after, each [n, 4, 4], in the report's order; those after stand in for missing ones before."""
     found = {image.name: image for image in read_poses_json(folder / POSES).images}
     images = [found[image.name] for image in report.images]
     after = [matrix_of(image.world_from_cam) for image in images]
@@ -247,7 +247,7 @@ def main() -> None:
 
 
 def small(path: Path, scratch: Path, views: int = VIEWS) -> Dataset:
-    """A few views of a set, small, under names of their own."""
+    """A few small views of a set, under new names."""
     truth = read_dataset(path)
     posed = tuple(frame for frame in truth.frames if frame.world_from_cam is not None)
     every = -(-len(posed) // views)

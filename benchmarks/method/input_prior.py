@@ -1,7 +1,7 @@
 """What the input's poses add to feature matches: ``python -m benchmarks.method.input_prior SET...``.
 
-Each SET holds true poses. Cameras are adjusted to all of its tracks and to few, without the input's poses and with them
-as a prior, by the factor of their deviations. The input has errors of its own, or is COLMAP's model. Prints a JSON line
+Each SET holds true poses. Cameras are adjusted to all of its tracks and to a few, without and with the input's poses as
+a prior, at several factors of their deviations. The input has random errors, or is COLMAP's model. Prints a JSON line
 for each: mean rotation errors (deg) after alignment.
 """
 

@@ -1,14 +1,14 @@
-"""A lens that is wrong or not known, found by the adjustment of all cameras to a set's feature matches.
+"""How well adjusting all cameras to a set's feature matches finds a wrong or unknown lens.
 
     python -m benchmarks.method.lens SET --focal 1.05
     python -m benchmarks.method.lens SET --hidden --focal 1.01
 
 The set's poses are the truth. They are turned and moved at random; all cameras are adjusted to tracks with the wrong
-focal length, and from there with the focal length unknown. Printed are mean rotation errors after alignment, and the
-focal length's error and standard deviation.
+focal length, and from there with the focal length unknown. Prints mean rotation errors after alignment, and the focal
+length's error and standard deviation.
 
 With --hidden the lens is replaced by one of a single focal length, without distortion and with its principal point in
-the middle. Printed are errors with the lens given, with more and more of it free, and with what the evidence supports.
+the middle. Prints errors with the lens given, with more and more parameters free, and with those the evidence supports.
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
-"""How long the adjustment of many cameras takes, and what it reaches: ``python -m benchmarks.method.many_cameras``.
+"""Time and accuracy of adjusting many cameras: ``python -m benchmarks.method.many_cameras``.
 
 ``--shapes ring corridor aerial --counts 100 300 1000 3000 --by sparse dense ceres``: the rigs of `camera_rigs`, each
-adjusted in a process of its own, on one thread, by our fronts, by one dense system (``dense``, the same code with all
+adjusted in its own process, on one thread, by our fronts, by one dense system (``dense``, the same code with all
 cameras in one front), and by Ceres with the same priors (needs the package pyceres; robust by Cauchy's loss, with the
 noise known, which ours measures).
 
-Prints of each the cost of our objective for an observation, processor seconds and memory, both followed by their ratio
-to the first of ``--by``, and mean errors of rotations and centres. Of ours also the seconds for the uncertainties, the
-share of centres within their bounds without `track_model_error`, and the largest difference from the dense covariances.
+Prints for each the cost of our objective per observation, processor seconds and memory, both with their ratio to the
+first of ``--by``, and mean errors of rotations and centres. For ours also the seconds for the uncertainties, the share
+of centres within their bounds without `track_model_error`, and the largest difference from the dense covariances.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ HEAD = (
 
 
 def measured(shape: str, count: int, by: str, out: Path) -> dict[str, Any]:
-    """Of one adjustment, in this process; covariances go to a file."""
+    """The figures of one adjustment in this process; covariances go to a file."""
     given = rig(shape, count)
     if by == "dense":
         dissection.ONE_FRONT = 1 << 30
@@ -82,7 +82,7 @@ def _by_ceres(given: Rig) -> Array:
 
 
 def _cost(given: Rig, poses: Array) -> float:
-    """Of our objective with the true noise, an observation."""
+    """The cost of our objective with the true noise, per observation."""
     cameras, tracks = Cameras.of(poses), given.evidence.tracks
     assert tracks is not None
     term = TrackTerm(tracks, given.evidence.intrinsics, cameras, NOISE_PX)
@@ -143,7 +143,7 @@ def main() -> None:
 
 
 def _off(covariances: dict[str, Any], by: str) -> str:
-    """The largest difference of the sparse covariances from the dense ones, by standard deviations."""
+    """The largest difference between sparse and dense covariances, in standard deviations."""
     if by == "ceres" or len(covariances) < 2 or covariances.get("dense") is None:
         return "–"
     sparse, dense = covariances["sparse"], covariances["dense"]

@@ -34,7 +34,7 @@ HEADING = ("set", "cameras", "features, matching", *PEERS)
 
 
 def asked(step: str, request: dict[str, Any]) -> dict[str, Any]:
-    """What `peers_child` answers; ``error`` where COLMAP itself failed."""
+    """The answer of `peers_child`; ``error`` if COLMAP itself failed."""
     work = Path(request["work"])
     path, answer, log = work / "request.json", work / "answer.json", work / "colmap.log"
     answer.unlink(missing_ok=True)
@@ -50,7 +50,7 @@ def asked(step: str, request: dict[str, Any]) -> dict[str, Any]:
 
 
 def measured(name: str, truth: Dataset, given: Dataset, seed: int) -> Iterator[Line]:
-    """A line for each peer, of a set with true poses and the same with noisy ones."""
+    """A line for each peer, on a set with true poses and its noisy copy."""
     with tempfile.TemporaryDirectory(prefix="biresnerf-benchmark-") as work:
         request = {**lay_out(given, Path(work)), "seed": seed}
         matches = asked("match", request)
@@ -64,7 +64,7 @@ def measured(name: str, truth: Dataset, given: Dataset, seed: int) -> Iterator[L
 
 
 def errors(truth: Dataset, found: dict[str, Any]) -> Line:
-    """Of the cameras that were placed, aligned by them."""
+    """The errors of the placed cameras, after alignment by them."""
     if "error" in found:
         return {"placed": 0, "error": found["error"]}
     line = {"placed": 0, "seconds": found["seconds"]}

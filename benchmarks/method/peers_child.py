@@ -1,7 +1,7 @@
-"""COLMAP as it comes, for `benchmarks.method.peers`: ``python -m benchmarks.method.peers_child REQUEST.json``.
+"""COLMAP with its own options, for `benchmarks.method.peers`: ``python -m benchmarks.method.peers_child REQUEST.json``.
 
-pycolmap stays in this process, as in `biresnerf.data.seeding.colmap_child`. All options are COLMAP's own, but for the
-lens, which is given and held.
+pycolmap is loaded only in this process, as in `biresnerf.data.seeding.colmap_child`. All options are COLMAP's defaults,
+except for the lens, which is given and fixed.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from biresnerf.data.seeding.colmap_pairs import matched_pairs, write_position_pr
 
 
 def match(request: dict[str, Any]) -> dict[str, Any]:
-    """SIFT of all photos, matches of all pairs; how long either took, and the database's numbers of the cameras."""
+    """SIFT of all photos, matches of all pairs; returns the seconds of both, and the database's camera ids."""
     import pycolmap
 
     database, photos = Path(request["work"], DATABASE), Path(request["root"])
@@ -44,7 +44,7 @@ def match(request: dict[str, Any]) -> dict[str, Any]:
 
 
 def place(request: dict[str, Any]) -> dict[str, Any]:
-    """The largest model that one mapper makes of the matches, as `read_mapping` reads it, and how long it took."""
+    """The largest model of one mapper, as `read_mapping` reads it, and how long it took."""
     import pycolmap
 
     mapper, guided = request["mapper"], request["priors"]
@@ -81,7 +81,7 @@ def _incremental_options(numbers: list[int], guided: bool) -> Any:
 
 
 def _global_options() -> Any:
-    """pycolmap 4.2 takes no priors of positions here; of poses, global mapping reads gravity alone."""
+    """pycolmap 4.2 accepts no position priors here; of pose priors, global mapping reads only gravity."""
     import pycolmap
 
     options = pycolmap.GlobalPipelineOptions()

@@ -1,9 +1,9 @@
-"""What seeding makes of a set of known poses: `python -m benchmarks.method.seeding SET [--missing 0.2] [--size 200]`.
+"""Seeding on a set of known poses: `python -m benchmarks.method.seeding SET [--missing 0.2] [--size 200]`.
 
-Without options all poses and lenses are taken away, as if SET were a folder of images. With `--missing`, that share
-of the poses is (`numpy.random.default_rng(0)`), and the others get BARF's noise (seed 1); lenses stay. Errors are
-rotations after alignment of all cameras by their centres. `--focal 1.05` makes given focal lengths 5 % too long,
-`--effort low` spends what a job does that ran out of memory before.
+Without options, all poses and lenses are removed, as if SET were a folder of images. `--missing` removes that share of
+the poses (`numpy.random.default_rng(0)`) and gives the others BARF's noise (seed 1); lenses stay. Errors are rotations
+after alignment of all cameras by their centres. `--focal 1.05` makes given focal lengths 5 % too long, `--effort low`
+uses the effort of a job that ran out of memory before.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from biresnerf.geometry.similarity import align_by_spread
 
 
 def without_cameras(truth: Dataset) -> Dataset:
-    """The photos as nobody has said anything about them."""
+    """The photos without any information about them."""
     cameras, frames = {}, []
     for frame in truth.frames:
         camera, source = guess_lens(read_header(frame.path, frame.name))
@@ -47,7 +47,7 @@ def without_cameras(truth: Dataset) -> Dataset:
 
 
 def with_missing_poses(truth: Dataset, missing: float, noise: float) -> Dataset:
-    """A share of the poses gone, the others noisy."""
+    """The set with a share of the poses missing, the others noisy."""
     count = len(truth)
     gone = set(np.random.default_rng(0).choice(count, round(missing * count), replace=False).tolist())
     noisy = perturb_poses(truth.world_from_cam, noise, seed=1)
@@ -61,7 +61,7 @@ def with_missing_poses(truth: Dataset, missing: float, noise: float) -> Dataset:
 
 
 def shrunk(truth: Dataset, size: int, folder: Path) -> Dataset:
-    """Copies of the photos in `folder`, `size` px at most, and the lenses with them."""
+    """Copies of the photos in `folder`, `size` px at most, with scaled lenses."""
     images = load_images(truth, size)
     frames = []
     for i, frame in enumerate(truth.frames):
@@ -75,7 +75,7 @@ def shrunk(truth: Dataset, size: int, folder: Path) -> Dataset:
 
 
 def with_focal(camera: Camera, times: float) -> Camera:
-    """The camera with its focal length, or both of them, so much longer."""
+    """The camera with its focal lengths multiplied by a factor."""
     count = 2 if camera.model in ("PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV") else 1
     return replace(
         camera, params=(*(times * focal for focal in camera.params[:count]), *camera.params[count:])

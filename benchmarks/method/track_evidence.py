@@ -1,4 +1,4 @@
-"""The tracks of a set as evidence, as a run adjusts cameras to them."""
+"""The tracks of a set as evidence, as in a run's adjustment."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MOST_OBSERVATIONS = EvidenceNumbers().most_observations
 
 
 def fitted_tracks(dataset: Dataset, tracks: Tracks | None, most: int = MOST_OBSERVATIONS) -> Evidence:
-    """The points that estimates may be fitted to, with `most` observations at most, through the set's lenses."""
+    """The points for fitting, with at most `most` observations, through the set's lenses."""
     intrinsics = Intrinsics.from_cameras([dataset.camera_of(i) for i in range(len(dataset))])
     ideal = ideal_cameras(intrinsics)
     if tracks is None:

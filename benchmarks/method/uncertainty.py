@@ -1,8 +1,8 @@
-"""Whether stated errors are true: ``python -m benchmarks.method.uncertainty SET... --run RUN TRUTH ...``.
+"""Tests whether stated errors are right: ``python -m benchmarks.method.uncertainty SET... --run RUN TRUTH ...``.
 
-Each SET holds true poses: cameras are adjusted to the tracks of its feature matches, from the truth, and their expected
-errors compared with their errors. A RUN is a finished one, whose report is compared with the poses of TRUTH. Prints for
-each how many of the errors are within the 90 % bounds, rotations and centres after alignment, and over all of them.
+Each SET holds true poses: cameras are adjusted from the truth to the tracks of its feature matches, and expected errors
+compared with actual ones. The report of a finished RUN is compared with the poses of TRUTH. Prints, for each and in
+total, how many rotation and centre errors after alignment are within the 90 % bounds.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 
 
 def of_set(folder: Path) -> tuple[Array, Array]:
-    """Errors over bounds [known, 2], rotation and centre, of cameras adjusted to tracks; and the errors (deg, %)."""
+    """Errors over bounds [known, 2] (rotation, centre) of cameras adjusted to tracks; and the errors (deg, %)."""
     truth = read_dataset(folder)
     with tempfile.TemporaryDirectory() as work:
         seed_poses(truth, seed=1, remember=Path(work) / "seeding.json")
@@ -50,7 +50,7 @@ def of_set(folder: Path) -> tuple[Array, Array]:
 
 
 def of_run(folder: Path, truth: Path) -> tuple[Array, Array]:
-    """The same of a finished run."""
+    """The same for a finished run."""
     document, true = read_poses_json(folder / POSES), read_poses(truth)
     images = {image.name: image for image in document.images}
     pairs = matched_names(list(images), list(true))

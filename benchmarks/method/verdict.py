@@ -1,4 +1,4 @@
-"""What the verdict's trainings say of two sets of poses: ``python -m benchmarks.method.verdict SCENE BEFORE AFTER``.
+"""The verdict's trainings on two sets of poses: ``python -m benchmarks.method.verdict SCENE BEFORE AFTER``.
 
 SCENE holds true poses. BEFORE and AFTER are each a file of poses, `truth`, or `noise:LEVEL:SEED` (BARF's noise on the
 truth). All are tied to the scene's frame first.

@@ -1,1 +1,1 @@
-"""Of whole runs: where their time goes, and how well it is predicted."""
+"""Whole runs: where their time goes, and how well it is predicted."""

@@ -49,7 +49,7 @@ COLUMNS = ("COLMAP", "start", OTHER, *WORK, "evaluating", "verdict", "writing")
 
 
 def processor_s() -> float:
-    """Of this process and of children that ended."""
+    """Processor seconds of this process and of its children that ended."""
     spent = os.times()
     return spent.user + spent.system + spent.children_user + spent.children_system
 

@@ -1,11 +1,11 @@
 """How accurate the predicted time left is: ``python -m benchmarks.runs.time_left SET... [--preset fast]``.
 
 Each SET holds true poses, which get BARF's noise (0.15). Prints how long each run took, and at 10, 25, 50,
-75 and 90 % of that time the predicted seconds to the end over the actual ones. With ``--phases`` a second table says
-of each phase what it was predicted to take from these moments on, and what it took (predicted / actual, s); its row
-``work`` holds the ratio of the amounts of work alone, at the general rates, which no load changes. Nothing is
-remembered from earlier runs. With ``--clock cpu`` all seconds are processor time, COLMAP's included, of one thread: the
-forecast lives by that clock, so that others on the machine hardly matter.
+75 and 90 % of that time the predicted seconds to the end over the actual ones. With ``--phases``, a second table gives
+each phase's remaining time at these moments (predicted / actual, s); its row ``work`` holds the ratio of the amounts of
+work alone, at the general rates, which no load changes. Nothing is remembered from earlier runs. With ``--clock cpu``,
+all seconds are processor time, COLMAP's included, of one thread; the forecast uses that clock, too, so that other load
+on the machine hardly matters.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ TICKS = os.sysconf("SC_CLK_TCK")
 
 
 def processor_s() -> float:
-    """Of this process and of its children, those that still run included."""
+    """Processor seconds of this process and its children, running ones included."""
     spent = os.times()
     return time.process_time() + spent.children_user + spent.children_system + _of_children(os.getpid())
 
 
 def _of_children(pid: int) -> float:
-    """Of a process's children that run, and of theirs."""
+    """Processor seconds of a process's running descendants."""
     total = 0.0
     try:
         for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
@@ -56,7 +56,7 @@ CLOCKS: dict[str, Callable[[], float]] = {"wall": time.monotonic, "cpu": process
 
 
 class Watched(Forecast):
-    """A forecast that keeps what it said of each phase at each report, and what the phase had taken by then."""
+    """A forecast that records, at each report, its prediction for each phase and the time taken so far."""
 
     def __init__(self, rates: Mapping[Unit, float], share: Callable[[float, float], float]) -> None:
         super().__init__(rates, share)
@@ -93,12 +93,12 @@ class Watched(Forecast):
         return super().now()
 
     def work_at(self, moment: float) -> float:
-        """Once the run is over: the amount of work that was predicted from a moment on over the actual one."""
+        """After the run: the ratio of predicted to actual work from a moment on."""
         _, left, done = self.amounts[max(0, bisect_right([when for when, _, _ in self.amounts], moment) - 1)]
         return left / max(at_general_rates(self.worked) - done, 1e-9)
 
     def phases_at(self, moment: float) -> dict[Phase, tuple[float, float]]:
-        """Of each phase, once the run is over: the seconds from a moment on, predicted and actual."""
+        """After the run: each phase's seconds from a moment on, predicted and actual."""
         _, said, taken = self.said[max(0, bisect_right([when for when, _, _ in self.said], moment) - 1)]
         rest = {phase: seconds - taken.get(phase, 0.0) for phase, seconds in self.taken.items()}
         return {p: (said.get(p, 0.0), rest.get(p, 0.0)) for p in UNITS if said.get(p) or rest.get(p)}
@@ -107,7 +107,7 @@ class Watched(Forecast):
 def told_and_taken(
     path: Path, preset: str, noise: float, settings: Mapping[str, Any], clock: str = "wall"
 ) -> tuple[float, list[float | None], list[dict[Phase, tuple[float, float]]], list[float]]:
-    """The seconds of a run, the ratios of the time told and the time that was left, both of each phase, and of work."""
+    """A run's seconds, its ratios of predicted to actual time left, both for each phase, and its ratios of work."""
     truth = read_scene(find_scene(path, 1, test_views=0))
     given = with_poses(truth, perturb_poses(truth.world_from_cam, noise, seed=1))
     told: list[tuple[float, float | None]] = []
@@ -143,7 +143,7 @@ def told_and_taken(
 
 
 def at_general_rates(amounts: Mapping[Phase, float]) -> float:
-    """Seconds of one core that these amounts of work take."""
+    """The seconds of one core that these amounts of work take."""
     return sum(amount * RATES[UNITS[phase]] for phase, amount in amounts.items())
 
 

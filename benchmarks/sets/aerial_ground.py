@@ -1,7 +1,7 @@
-"""A made neighbourhood seen from above: terrain, houses, roads and trees as functions of the place, without storage.
+"""A synthetic neighbourhood from above: terrain, houses, roads and trees as functions of position.
 
-Metres, z up. All of it follows from hashes of the place and a seed, so that a square kilometre takes no memory and each
-photo of it is the same wherever it is rendered.
+Metres, z up. Everything follows from hashes of position and seed, so a square kilometre takes no memory, and photos are
+the same on every machine.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def _hash(i, j, salt):
 
 @njit(cache=True)
 def _noise(x, y, period, salt):
-    """Smooth noise from -1 to 1 whose hills are about ``period`` wide."""
+    """Smooth noise from -1 to 1 with hills about ``period`` wide."""
     x, y = x / period, y / period
     i, j = int(np.floor(x)), int(np.floor(y))
     u, v = x - i, y - j
@@ -99,7 +99,7 @@ def _height(x, y, seed):
 
 @njit(cache=True)
 def _detail(x, y, seed, finest):
-    """Several scales of noise, the finest of which a photo can show, from -1 to 1 mostly."""
+    """Noise at several scales, the finest visible in photos; mostly from -1 to 1."""
     value, weight, period = 0.0, 0.5, 8.0
     for octave in range(7):
         if period < finest:
@@ -149,7 +149,7 @@ def _wall_colour(x, y, z, seed, finest):
 
 @njit(cache=True, parallel=True)
 def _tops(x0, y0, columns, rows, seed):
-    """What nothing is higher than, for cells of a metre from the corner (x0, y0) on, [rows, columns]."""
+    """An upper bound of the height in each 1 m cell from the corner (x0, y0) on, [rows, columns]."""
     raw = np.zeros((rows, columns))
     for row in prange(rows):
         for column in range(columns):
@@ -177,9 +177,7 @@ def _meet(origin, direction, tops, x0, y0, seed):
     """Distance along a descending ray to the surface."""
     ox, oy, oz = origin[0], origin[1], origin[2]
     dx, dy, dz = direction[0], direction[1], direction[2]
-    cell = 0.9 / max(
-        abs(dx), abs(dy), 1e-9
-    )  # no farther than the next cell, whose top is in that of this one
+    cell = 0.9 / max(abs(dx), abs(dy), 1e-9)  # not beyond the next cell, whose top this cell's includes
     t = before = max(0.0, (oz - HIGHEST) / -dz)
     while True:
         x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
@@ -204,7 +202,7 @@ def _meet(origin, direction, tops, x0, y0, seed):
 
 @njit(cache=True)
 def _light(x, y, z, tops, x0, y0, seed):
-    """Of a place of the surface that is no wall: by its slope, and whether something stands before the sun."""
+    """The light on a surface point that is not on a wall: by its slope, and whether it is in shadow."""
     e = 0.15
     here = _height(x, y, seed)
     gx, gy = (_height(x + e, y, seed) - here) / e, (_height(x, y + e, seed) - here) / e
@@ -220,7 +218,7 @@ def _light(x, y, z, tops, x0, y0, seed):
 
 @njit(cache=True)
 def _colour(origin, direction, tops, x0, y0, seed, pixel):
-    """What a ray shows, and how far away it is; ``pixel`` is the angle of a pixel."""
+    """The colour that a ray sees, and its distance; ``pixel`` is the angle of a pixel."""
     t = _meet(origin, direction, tops, x0, y0, seed)
     x, y, z = origin[0] + t * direction[0], origin[1] + t * direction[1], origin[2] + t * direction[2]
     finest = 2 * t * pixel
@@ -267,7 +265,7 @@ def _trace(world_from_cam, width, height, focal, tops, x0, y0, seed, samples):
 def render(
     world_from_cam: NDArray[np.float64], width: int, height: int, focal: float, seed: int, samples: int = 2
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """One photo by a pinhole centred in it, which looks down.
+    """One photo of a centred pinhole camera that looks down.
 
     Returns:
         linear colours [height, width, 3], each pixel the mean of ``samples`` x ``samples`` rays, and the depth along

@@ -1,4 +1,4 @@
-"""A set's photos as a lens with distortion would have taken them, to find that lens from photos alone.
+"""Warps a set's photos as if taken by a lens with distortion, to test finding that lens from photos alone.
 
     python -m benchmarks.sets.bent_photos SET OUT [--photos FOLDER]
     biresnerf refine OUT/alone -o RESULT && biresnerf evaluate RESULT OUT/truth.json
@@ -61,14 +61,14 @@ def main() -> None:
 
 
 def _resized(given: dict[str, Any], width: int, height: int) -> dict[str, float]:
-    """The set's lens, of photos of another size."""
+    """The set's lens, scaled to photos of another size."""
     x, y = width / given["w"], height / given["h"]
     scale = {"fl_x": x, "cx": x, "fl_y": y, "cy": y}
     return {name: given.get(name, 0.0) * scale.get(name, 1.0) for name in LENS}
 
 
 def _source(lens: dict[str, float], bent: dict[str, float], width: int, height: int) -> Tensor:
-    """Where [h, w, 2] a photo shows what the bent lens has at each pixel, from -1 to 1 over its edges."""
+    """Where [h, w, 2] in the original photo each pixel of the bent lens lies; -1 and 1 are its edges."""
     old, new = (
         Intrinsics.from_cameras([Camera("OPENCV", width, height, tuple(each[name] for name in LENS))])
         for each in (lens, bent)

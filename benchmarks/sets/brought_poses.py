@@ -1,12 +1,12 @@
-"""Sets as people bring them, made from one whose poses are known.
+"""Sets as users bring them, made from one whose poses are known.
 
     python -m benchmarks.sets.brought_poses SET OUT [--seed 1]
     biresnerf refine OUT/predicted -o RESULT && biresnerf evaluate RESULT SET
     biresnerf refine OUT/first -o FIRST && biresnerf refine OUT/all -o ALL --fixed-from FIRST
 
-OUT gets `predicted`, the photos beside a predictions.npz as VGGT writes it: each camera turned by 2 degrees and moved
-by 5 % of the distance (standard deviations), in another scale, with 7 % more focal length; `first`, two of three photos
-with BARF's noise of 0.05 on their poses; and `all`, the photos alone. SET is a folder with images and transforms.json.
+OUT gets `predicted`, the photos and a predictions.npz as VGGT writes it: cameras turned by 2 degrees and moved by 5 %
+of the distance (standard deviations), another scale, focal length 7 % too long; `first`, two of three photos with
+BARF's noise of 0.05 on their poses; and `all`, the photos alone. SET is a folder with images and transforms.json.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def _link_photos(dataset: Dataset, folder: Path) -> None:
 
 
 def _predict(dataset: Dataset, seed: int, path: Path) -> None:
-    """Writes what a feed-forward model would say of the photos in the order of their names."""
+    """Writes a feed-forward model's predictions for the photos, in the order of their names."""
     camera, count = dataset.camera_of(0), len(dataset)
     scale = WIDTH / camera.width
     height = round(camera.height * scale / PATCH) * PATCH

@@ -1,4 +1,4 @@
-"""A drone's photos of a made neighbourhood, with exact truth: for sets of hundreds to thousands of photos.
+"""A drone's photos of a synthetic neighbourhood, with exact truth: for hundreds to thousands of photos.
 
     python -m benchmarks.sets.made_aerial OUT --photos 500 [--width 1000] [--poses]
     biresnerf refine OUT --output RESULT
@@ -6,8 +6,8 @@
 
 The drone flies lines over a square, as mapping flights do: photos overlap by 80 % along a line and by 65 % across.
 Photos are JPEG with the EXIF and XMP that a DJI Mavic 3 writes; positions are off by `--metres`, yaw and pitch of the
-gimbal by `--degrees`. With `--poses`, OUT/transforms.json holds the poses that these say, turned and shifted alike.
-A photo that is there is not rendered again, so a command that was stopped goes on.
+gimbal by `--degrees`. With `--poses`, OUT/transforms.json holds poses with errors of the same sizes. Existing photos
+are not rendered again, so a stopped command can be resumed.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def poses_of(yaw_deg: Array, pitch_deg: Array, centres: Array) -> Array:
 
 
 def flight(count: int, rng: np.random.Generator) -> tuple[Array, Array, Array]:
-    """Yaw, pitch (degrees) [count] and centres (m) [count, 3] of a flight in lines over about a square."""
+    """Yaw, pitch (degrees) [count] and centres (m) [count, 3] of a flight in lines over a near-square."""
     footprint = ABOVE_M / FOCAL_OF_WIDTH * np.array([1.0, 0.75])
     apart, step = footprint * (1 - np.array([ACROSS, ALONG]))
     lines = max(1, round((count * step / apart) ** 0.5))
@@ -59,7 +59,7 @@ def flight(count: int, rng: np.random.Generator) -> tuple[Array, Array, Array]:
 def write_photo(
     path: Path, truth: Array, said: Array, number: int, width: int, seed: int, metres: float
 ) -> None:
-    """Render the true pose, and write what the drone believes."""
+    """Render at the true pose, and write the drone's metadata."""
     focal = FOCAL_OF_WIDTH * width
     linear, _ = render(truth, width, width * 3 // 4, focal, seed)
     shown = np.rint(255 * np.clip(EXPOSED * linear, 0, 1) ** (1 / 2.2)).astype(np.uint8)

@@ -1,9 +1,9 @@
-"""A set whose photos show a thing from farther away: small, before much black.
+"""Turns a set into photos of a small thing on a large black background.
 
     python -m benchmarks.sets.small_things SET OUT [--thing 64] [--photo 224]
     biresnerf compare OUT -o RESULT --preset fast --set start=auto
 
-The photos of SET, a transforms file, are shrunk to `--thing` px, and lie in the middle of black ones of `--photo` px.
+The photos of SET, a transforms file, are shrunk to `--thing` px and centred in black ones of `--photo` px.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Timing competitors in turns: a machine that others use drifts, and the ratio within a round does not."""
+"""Times competitors in turn: a shared machine's speed drifts, but the ratio within a round does not."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def interleave(
 ) -> dict[str, list[float]]:
     """Seconds of each competitor in each round.
 
-    Each runs `warm` times first, and in every round once unmeasured: thread pools sleep while another competitor runs.
+    Each runs `warm` times first, and once unmeasured in every round: thread pools sleep while another one runs.
     """
     for run in competitors.values():
         for _ in range(warm):
@@ -45,7 +45,7 @@ def ratio(slow: list[float], fast: list[float]) -> float:
 
 @contextmanager
 def timed(functions: list[tuple[Any, str, str]], clock: Clock) -> Iterator[dict[str, float]]:
-    """Within this context, seconds spent in (owner, attribute, label) add up under their labels."""
+    """Within this context, adds up the seconds spent in each (owner, attribute, label) under its label."""
     spent = {label: 0.0 for _, _, label in functions}
     kept = [(owner, name, getattr(owner, name)) for owner, name, _ in functions]
 

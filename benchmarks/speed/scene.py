@@ -1,4 +1,4 @@
-"""A made scene for measuring, and its optimisation in the middle of either stage."""
+"""A synthetic scene for measurements, and its optimisation in the middle of either stage."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def _views(size: int) -> np.ndarray:
 
 
 def photos(count: int, size: int) -> ImageSet:
-    """Photos of `size` px a side."""
+    """Synthetic photos of `size` px a side."""
     camera = Camera("SIMPLE_PINHOLE", size, size, (synthetic_focal(size), size / 2, size / 2))
     return ImageSet(
         pixels=_views(size)[np.arange(count) % VIEWS].reshape(-1, 3),
@@ -45,7 +45,7 @@ def photos(count: int, size: int) -> ImageSet:
 def untrained(
     images: int, threads: int, size: int, preset: str, device: torch.device = CPU
 ) -> JointOptimiser:
-    """From true poses; as many steps of either stage as are trained here, and as many to come."""
+    """An optimiser at the true poses; each stage is twice as long as it is trained here."""
     options = RefineOptions(preset=preset, device=device.type, max_image_size=size, steps=4 * STEPS)
     options = options.model_copy(update={"coarse_steps_max": 2 * STEPS}).resolved(device.type)
     photo_set, poses = photos(images, size), synthetic_cameras(VIEWS, SEED)[np.arange(images) % VIEWS]
@@ -69,7 +69,7 @@ def _trained(stage: str, threads: int, size: int, preset: str) -> JointOptimiser
 def optimiser(
     stage: str, images: int, threads: int, rays: int, size: int = 200, preset: str = "paper"
 ) -> JointOptimiser:
-    """An optimiser of the given preset's encodings in the middle of a stage."""
+    """An optimiser with the preset's encodings in the middle of a stage."""
     trained, made = _trained(stage, threads, size, preset), untrained(images, threads, size, preset)
     if stage == "fine":
         made.start_reconstruction()
@@ -82,7 +82,7 @@ def optimiser(
 
 
 def step(joint: JointOptimiser, rays: int) -> int:
-    """One step of the whole training without the occupancy update, at the same place of the schedule each time.
+    """One training step without the occupancy update, always at the same point of the schedule.
 
     Returns its samples before any were merged.
     """

@@ -1,4 +1,4 @@
-"""A whole training step and what its parts take: `make bench`. The definition in plain torch may compete."""
+"""Times a whole training step and its parts: `make bench`. The definition in plain torch may compete."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ DEFINITION = "plain torch"
 
 
 def _every_interval(ours: JointOptimiser) -> JointOptimiser:
-    """The same optimisation with a sample in every live interval; photos, poses and field are shared."""
+    """The same optimisation with a sample in every live interval; shares photos, poses and field."""
     rival = copy.copy(ours)
     rival.method = replace(ours.method, merging=None)
     return rival
 
 
 def _cells_s(ours: JointOptimiser, rounds: int, clock: Clock) -> dict[str, float]:
-    """Seconds a step that the occupancy grid's updates take, by the estimate of the density and by the density."""
+    """Seconds per step for the occupancy grid's updates, with estimated and with exact density."""
     estimate, field = ours.field.estimate, ours.field
     kept = {name: tensor.clone() for name, tensor in ours.occupancy.state().items()}
 
@@ -66,7 +66,7 @@ def _cells_s(ours: JointOptimiser, rounds: int, clock: Clock) -> dict[str, float
 
 
 def _definition(ours: JointOptimiser) -> JointOptimiser:
-    """The same on the field that defines what the kernels compute, which is trained as far."""
+    """The same with the field that defines the kernels, trained equally far."""
     rival, field = _every_interval(ours), ReferenceField(ours.field.shape, 0, scene.CPU)
     field.load_state(ours.field.state())
     rival.field = field
@@ -74,7 +74,7 @@ def _definition(ours: JointOptimiser) -> JointOptimiser:
 
 
 def _parts_ms(joint: JointOptimiser, rays: int, steps: int, clock: Clock) -> dict[str, float]:
-    """Medians of what the parts of a step take."""
+    """Median times of a step's parts."""
     parts: dict[str, list[float]] = {}
     for _ in range(steps):
         with timed(OPERATIONS, clock) as spent:

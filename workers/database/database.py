@@ -66,7 +66,7 @@ class Connection(psycopg.AsyncConnection[DictRow]):
         return row
 
     async def value(self, statement: Statement, *parameters: Any) -> Any:
-        """The first value of the first row; none where there is no row."""
+        """The first value of the first row; None if there is no row."""
         row = await self.row(statement, *parameters)
         return None if row is None else next(iter(row.values()))
 
