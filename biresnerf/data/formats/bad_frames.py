@@ -1,4 +1,4 @@
-"""What becomes of a set of which a few frames are bad: the others are read, and what was left out is said."""
+"""Sets with a few bad frames: the others are read, and a note says what was left out."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ T = TypeVar("T")
 
 
 def attempt(make: Callable[[], T]) -> T | InputError:
-    """What ``make`` gives, or the error that it raises. ``unsafe_path`` is raised on: it is no slip of one frame."""
+    """What ``make`` gives, or the error that it raises. ``unsafe_path`` is raised: it is no slip of one frame."""
     try:
         return make()
     except InputError as error:
@@ -47,7 +47,7 @@ def missing_images(missing: Sequence[str], total: int, where: str, hint: str, *,
 def good_frames(
     outcomes: Sequence[T | InputError], names: Sequence[str], *, strict: bool
 ) -> tuple[list[T], list[int], list[str]]:
-    """What was made of the good frames, their indices, and a note on the others.
+    """The results of the good frames, their indices, and a note on the others.
 
     Raises:
         InputError: the first of ``outcomes``, by the rule of `tolerate`.
@@ -64,5 +64,5 @@ def good_frames(
 
 
 def said(error: InputError) -> str:
-    """The error in a note's words: the place, and what is wrong there."""
+    """The error as text for a note: the place, and what is wrong there."""
     return f"{error.where}: {error.detail.removesuffix('.')}"

@@ -24,7 +24,7 @@ class WriteContext:
     Attributes:
         dataset: the input; None where a finished result is read back and written again.
         bounds: depths of the nearest and farthest point, where the user gave them.
-        should_stop: long writers ask it, and raise `Interrupted`.
+        should_stop: long writers call it, and raise `Interrupted` once it returns true.
     """
 
     dataset: Dataset | None = None
@@ -60,7 +60,7 @@ def head_holds(*markers: bytes) -> Callable[[Path], bool]:
 
 
 def head_matches(pattern: bytes) -> Callable[[Path], bool]:
-    """Whether a file begins so."""
+    """A test whether a file begins with a match of ``pattern``."""
     return lambda path: re.match(pattern, head_of(path)) is not None
 
 
@@ -77,13 +77,13 @@ def cannot_hold(where: str, what: str, hint: str = _PINHOLE_HINT) -> InputError:
 
 @dataclass(frozen=True)
 class LensLimits:
-    """What lenses a program has.
+    """The lenses that a program supports.
 
     Attributes:
         program: what people call it.
         coefficients: of its perspective lens.
         fisheye: of its fisheye; None where it has none.
-        two_focal_lengths: whether pixels may be other than square.
+        two_focal_lengths: whether pixels may be non-square.
         off_centre: whether the principal point may lie elsewhere than in the picture's middle.
         hint: what to do with other lenses.
     """

@@ -98,8 +98,8 @@ def _photos_alone(root: Path) -> tuple[list[Path], list[Path], tuple[str, ...]]:
 def _videos_beside(root: Path, videos: Sequence[Path], photos: Sequence[Path]) -> list[Path]:
     """The videos whose frames count as photos: where there are no others, or these lie in the same folder.
 
-    Photos in a folder of their own may well be frames of the video. One that is called as a photo beside it was taken
-    with that photo by a phone, and is no more than it.
+    Photos in a folder of their own may well be frames of the video. A video named like a photo beside it was taken with
+    that photo by a phone, and shows no more.
     """
     if any(path.parent != root for path in photos):
         return []
@@ -192,7 +192,7 @@ class _Found:
 def _found(root: Path) -> list[_Found]:
     """All poses of a set, the first of which is read: those in ``root`` itself, else the nearest in folders below.
 
-    A model without photos beside it gives way to one that has some, as a program that straightens photos writes.
+    A model without photos beside it yields to one with photos, such as programs write that undistort photos.
     """
     here = list(_pose_places(root))
     if here and (ALL_CODECS[here[0].format].count is None or images_beside(here[0].root)):
@@ -248,7 +248,7 @@ def _pose_places(root: Path) -> Iterator[_Found]:
 
 
 def _largest(codec: Codec, place: Path) -> Path:
-    """Of places that a number alone tells apart (sparse/0, sparse/1), that with most images."""
+    """Of places that differ only by a number (sparse/0, sparse/1), the one with most images."""
     if codec.count is None or not place.name.isdecimal():
         return place
     numbered = [path for path in visible(place.parent) if path.name.isdecimal() and codec.recognises(path)]

@@ -26,7 +26,7 @@ class FrameCamera(NamedTuple):
         source: who found its intrinsics.
         shared: whether other images share them, as the input says.
         notes: for the user.
-        taken_with: the photo's, where the intrinsics are not given: what differs in it has another lens.
+        taken_with: the photo's, where the intrinsics are not given: photos that differ in it have different lenses.
     """
 
     camera: Camera
@@ -41,7 +41,7 @@ LensOf: TypeAlias = Callable[[ImageHeader, str], FrameCamera]
 
 
 def panorama_lens(header: ImageHeader, name: str) -> FrameCamera:
-    """`LensOf` of panoramas. Raises InputError ``camera_model_unsupported`` for a photo that is no whole one."""
+    """`LensOf` of panoramas. Raises InputError ``camera_model_unsupported`` for a photo that is no full panorama."""
     return FrameCamera(panorama_camera(header.width, header.height, name))
 
 
@@ -111,7 +111,7 @@ def without_problems(parsed: ParsedPoses, *, strict: bool = False) -> ParsedPose
     """The same with a note on the entries that have a problem; they stay, without pose.
 
     Raises:
-        InputError: the first problem, where less than most of the entries, or fewer than three, are good.
+        InputError: the first problem, unless most of the entries and at least three are good.
     """
     bad = [entry for entry in parsed.entries if entry.problem is not None]
     notes = parsed.notes

@@ -54,10 +54,10 @@ def parsed_rows(
     """The poses of ``rows``; a row that cannot be read keeps its problem.
 
     Args:
-        form: what the rows are of.
+        form: the format of the rows.
         read: gives pose and lens of what stands at a place. Raises InputError.
-        in_order_of_names: the rows name no images, but are in the order of their names, which is this one.
-        order_hint: where these are not as many.
+        in_order_of_names: given where rows name no images, but are in the order of their names; says which order.
+        order_hint: for a message where the number of images differs.
 
     Raises:
         InputError: ``duplicate_image`` for a name that two rows have, ``pose_file_invalid`` for too many rows.
@@ -104,7 +104,7 @@ def named_rows(values: list[Any], place: str, key: str, hint: str) -> list[Row]:
 
 
 def entry_of(name: str, where: str, read: Callable[[], Placed]) -> PoseEntry:
-    """The entry of one row. Raises InputError ``unsafe_path`` only; another is its problem."""
+    """The entry of one row. Raises InputError ``unsafe_path`` only; any other becomes its problem."""
     found = attempt(read)
     if isinstance(found, InputError):
         return PoseEntry(name, None, where, problem=found)
@@ -196,7 +196,7 @@ def shear_of(skew_px: float, focal_y: float, where: str) -> float:
 
 
 def without_skew(camera: Camera, shear: float, where: str) -> Camera:
-    """A camera given with all but its skew, as one of photos that are straightened: see `Camera.shear`.
+    """A camera, given without its skew, for photos that are straightened: see `Camera.shear`.
 
     Raises:
         InputError: ``intrinsics_invalid``.

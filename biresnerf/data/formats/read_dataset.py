@@ -45,8 +45,8 @@ def read_dataset(
         path: a folder, or the file in it that has the poses, or a video.
         within: refuse files outside of this folder; for uploaded sets.
         strict: refuse the set for one bad frame, else leave bad frames out where most are good.
-        videos: how many frames of videos are wanted. They are written beside these, into video_frames/, where they are
-            not there already.
+        videos: how many frames of videos are wanted. They are written beside the videos, into video_frames/, unless
+            they are there already.
 
     Raises:
         InputError: the input cannot be used; says the file, the field and a hint.
@@ -137,7 +137,7 @@ def read_poses(path: Path) -> dict[str, NDArray[np.float64]]:
 
 
 def seen_points(path: Path) -> dict[str, set[int]]:
-    """The ids of the points that each image sees, by its name as in `read_poses`; none of any but COLMAP's models."""
+    """The ids of the points that each image sees, by its name as in `read_poses`; empty for all but COLMAP's models."""
     contents = find_input(path)
     if contents.format is None or contents.poses is None:
         return {}
@@ -147,7 +147,7 @@ def seen_points(path: Path) -> dict[str, set[int]]:
 
 
 def find_input(path: Path, within: Path | None = None) -> FolderContents:
-    """What of ``path`` is read. Raises InputError where nothing is there that can be."""
+    """What is read of ``path``. Raises InputError where it holds nothing readable."""
     if path.is_file():
         return look_at(path, within)
     if path.is_dir():
@@ -176,7 +176,7 @@ def _read_images(root: Path, images: Sequence[Path], within: Path | None, *, str
 
 
 def _named_entries(parsed: ParsedPoses, root: Path) -> Sequence[PoseEntry]:
-    """The entries by names of their own, else by those of the images beside them, where these fit."""
+    """The entries by their own names, else by those of the images beside them, where these fit."""
     beside = [] if parsed.named else sorted(photos_beside(root, parsed.photo_folders), key=natural_key)
     if beside and parsed.assign is not None:
         try:

@@ -69,16 +69,16 @@ def export_result(
     context: WriteContext,
     poses_of: PosesOf = "camera",
 ) -> tuple[list[str], list[str]]:
-    """Writes formats where a result in ``folder`` has them; the poses of what carries the camera into its body/.
+    """Writes formats at their places in a result in ``folder``; the poses of the camera's body into its body/.
 
-    These also as every result has them.
+    The body's poses are also written in the formats that every result has.
 
     Returns:
         the formats written, and notes: what is not known of the offset, and what stands for what.
 
     Raises:
         InputError: ``export_not_possible``: a format cannot hold the set, or shows what cameras see where the body's
-            poses are asked for, or no offset is known; others are written.
+            poses are requested, or no offset is known; others are written.
     """
     names = list(dict.fromkeys(names))
     if poses_of == "camera":

@@ -1,4 +1,4 @@
-"""Poses in forms that are not read, so that no set is taken for photos alone in silence.
+"""Detects poses in forms that are not read, so that no set is silently treated as photos alone.
 
 Forms of known programs are recognised by name and first bytes; other files by their numbers, which are as many as
 poses of the photos would be, or stand beside the photos' names.
@@ -55,7 +55,7 @@ UNREAD = (
 
 
 def _unread_form(path: Path) -> UnreadForm | None:
-    """That of a file which holds camera poses of a program whose form is not read; None of others."""
+    """The unread form of a file that holds camera poses of a program; None for other files."""
     called = (form for form in UNREAD if any(fnmatch(path.name, name) for name in form.names))
     return next((form for form in called if re.match(form.begins, head_of(path))), None)
 
@@ -76,7 +76,7 @@ def refuse_unread(root: Path) -> None:
 def folders_of_set(root: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
     """The folders in which files of a set are looked for, with the names of the folders and files in each.
 
-    Hidden folders are none, nor those of results of ours.
+    Hidden folders and those of our results are left out.
     """
     for count, (parent, folders, files) in enumerate(os.walk(root)):
         folders[:] = sorted(name for name in folders if not name.startswith((".", "__")))
@@ -89,7 +89,7 @@ def folders_of_set(root: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
 
 
 def pose_like_notes(root: Path, names: Sequence[str], known: Sequence[Path] = ()) -> list[str]:
-    """A note on files that may hold poses of the photos ``names``, but ``known`` ones."""
+    """A note on files that may hold poses of the photos ``names``, except ``known`` ones."""
     stems = {_stem(name) for name in names}
     found: list[str] = []
     notes: list[str] = []

@@ -1,4 +1,4 @@
-"""Several formats of one set written, each by itself; what cannot hold the set's lenses has another in its place."""
+"""Write several formats of one set separately; a format that cannot hold the set's lenses is replaced by another."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from biresnerf.options.formats import formats
 
 @dataclass
 class Writing:
-    """What became of the formats.
+    """The outcome for the formats.
 
     Attributes:
         written: their names.
-        notes: a sentence for each that has another in its place, and for what programs will miss.
+        notes: a sentence for each that was replaced by another, and for what programs will miss.
         refused: why the others were not written.
     """
 
@@ -33,7 +33,7 @@ class Writing:
 def write_each(refined: RefinedSet, names: Iterable[str], write: Callable[[str], None]) -> Writing:
     """Calls ``write`` for each name, and where that format cannot hold the set, for what it declares as ``instead``.
 
-    Without the photos of ``refined`` nothing stands in for another.
+    Without the photos of ``refined`` no format is replaced.
     """
     result, waiting = Writing(), list(dict.fromkeys(names))
     with_photos = all(image.path is not None for image in refined.images)

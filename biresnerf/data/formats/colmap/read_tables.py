@@ -1,4 +1,4 @@
-"""COLMAP's tables, binary or text: each layout stands once, above what takes its fields from bytes and from words.
+"""COLMAP's tables, binary or text: each layout is declared once, on top of readers of bytes and of words.
 
 Layouts: src/colmap/scene/reconstruction_io_binary.cc, little-endian throughout, and reconstruction_io_text.cc. Nothing
 is allocated before the file is known to hold it. `model_checks` compares the tables with each other.
@@ -35,7 +35,7 @@ class BinaryTable:
         self.data, self.file, self.at = data, file, 0
 
     def rows(self) -> Iterator[None]:
-        """Stops at each row, whose fields are to be taken then; refuses bytes after the last one."""
+        """Yields at each row, so that the caller takes its fields; refuses bytes after the last one."""
         for _ in range(self.whole("the number of rows")):
             yield
         self._finish()
@@ -132,7 +132,7 @@ class TextTable:
         self.lines = iter(enumerate(text.split("\n"), start=1))
 
     def rows(self) -> Iterator[None]:
-        """Stops at each line that says something, whose words are to be taken then; refuses more words."""
+        """Yields at each line with content, so that the caller takes its words; refuses words left over."""
         for number, line in self.lines:
             self.line, self.words, self.at = line.strip(), line.split(), 0
             self.where = f"{self.file} line {number}"
@@ -193,7 +193,7 @@ class TextTable:
         return name
 
     def features(self, where: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Those in the next line, which may be empty."""
+        """The features in the next line, which may be empty."""
         number, line = next(self.lines, (0, ""))
         where, words = f"{self.file} line {number}", line.split()
         if len(words) % 3:

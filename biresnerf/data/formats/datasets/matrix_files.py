@@ -3,7 +3,7 @@
 Camera to world, OpenCV axes. Lenses stand in files beside: ``intrinsic/NAME.txt`` (MobileBrick, an ARKit capture),
 ``intrinsics/NAME.txt`` (NeRF++; pixels from the corner: nerf_sample_ray_split.py of Kai-46/nerfplusplus),
 ``intrinsic/intrinsic_color.txt`` (ScanNet), ``intrinsics.txt`` (NSVF: a matrix, or f, cx, cy and 0 in the first line),
-``camera-intrinsics.txt`` (3DMatch). The others take a pixel's coordinates for its indices: load_intrinsics and
+``camera-intrinsics.txt`` (3DMatch). In the others a pixel's coordinates are its indices: load_intrinsics and
 get_uv in fairnr/data/data_utils.py of facebookresearch/NSVF, depth2xyz in utils/geometry.py of
 ActiveVisionLab/MobileBrick, the kernel of fusion.py in andyzeng/tsdf-fusion-python, which also shows 7-Scenes' axes.
 ScanNet's axes: nerfstudio's scannet_dataparser.py. A pose that was lost is infinite there.

@@ -103,7 +103,7 @@ def the_chunk(file: Path) -> ElementTree.Element:
 
 
 def cameras_by_label(chunk: ElementTree.Element, file: Path) -> dict[str, ElementTree.Element]:
-    """The cameras by label, but those switched off."""
+    """The cameras by label, except those switched off."""
     entries: dict[str, ElementTree.Element] = {}
     for entry in chunk.iter("camera"):
         label = image_name(entry.get("label") or "", f"{file.name} camera {entry.get('id')}")

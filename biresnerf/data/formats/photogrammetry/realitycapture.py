@@ -3,12 +3,12 @@
 The program's source is closed: columns and conventions of the csv are those by which nerfstudio reads the file
 (process_data/realitycapture_utils.py, 1.1.5). Heading (clockwise), pitch and roll are degrees: world_from_cam with
 OpenGL axes is Rz(-heading) Rx(pitch) Ry(roll). The focal length is that of a film 36 mm wide; px and py are shares of
-the longer side, from the centre; t1 and t2 are OpenCV's p1 and p2. Of omega, phi and kappa it is
-Ry(kappa) Rx(phi) Rz(-omega): so the program's XMP files of the same photos have it, to 1e-13.
+the longer side, from the centre; t1 and t2 are OpenCV's p1 and p2. With omega, phi and kappa it is Ry(kappa) Rx(phi)
+Rz(-omega), as in the program's XMP files of the same photos, to 1e-13.
 
 Axes and units of an XMP: its support article "RealityCapture XMP camera math": the rotation is cam_from_world by rows,
 OpenCV axes, beside the camera's centre; lengths as in the csv. Coefficients are k1 to k4, t1 and t2; t1 is OpenCV's p2
-and t2 its p1, as AliceVision (src/software/convert/main_importKnownPoses.cpp) and camorph take them. nerfstudio takes
+and t2 its p1, as AliceVision (src/software/convert/main_importKnownPoses.cpp) and camorph read them. nerfstudio reads
 those of the csv the other way round; both are zero unless a model with tangential distortion was chosen.
 """
 
@@ -122,7 +122,7 @@ def parse_realitycapture(_root: Path, file: Path) -> ParsedPoses:
 
 
 def _perhaps_radians(file: str, table: Table, angles: Sequence[str]) -> list[str]:
-    """A note where no angle of the table is larger than a whole turn is in radians, and some are no small ones."""
+    """A note where no angle of the table exceeds a full turn in radians, although some are not small."""
     with suppress(ValueError):  # rows that cannot be read say so themselves
         largest = max(abs(float(table.cell(row, name))) for _, row in table.rows for name in angles)
         if math.pi / 4 < largest <= 2 * math.pi:

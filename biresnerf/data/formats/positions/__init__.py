@@ -1,1 +1,1 @@
-"""Where photos were taken, as far as something beside the poses says: GPS in EXIF, tables, Metashape's references."""
+"""Where photos were taken, by data other than the poses: GPS in EXIF, tables, Metashape's references."""

@@ -47,12 +47,12 @@ class _Row:
 
 
 def control_files(root: Path) -> list[Path]:
-    """The files in the folder ``root`` that are called as lists of control points, the preferred one first."""
+    """The files in the folder ``root`` that are named as lists of control points, the preferred one first."""
     return files_called(root, CONTROL_FILES)
 
 
 def control_points(dataset: Dataset) -> ControlPoints | None:
-    """Those that two photos of the set show, of the first file beside the photos; None without such a file or point.
+    """The points that two photos of the set show, from the first file beside the photos; None if there are none.
 
     Raises:
         InputError: ``control_points_invalid``, with the line; or a code of `decode`, where it names markers.
@@ -116,7 +116,7 @@ def control_notes(dataset: Dataset) -> tuple[str, ...]:
 
 
 def _markers(rows: list[_Row]) -> list[str]:
-    """Names of markers that no row says where to see."""
+    """Names of markers for which no row says where photos show them."""
     shown = {row.name for row in rows if row.image}
     return [row.name for row in rows if row.name not in shown and is_marker(row.name)]
 
@@ -127,7 +127,7 @@ def _rows_of(file: Path) -> tuple[list[_Row], bool, int | None]:
 
 
 def _of_odm(file: Path) -> tuple[list[_Row], bool, int | None]:
-    """OpenDroneMap's: a frame, then x (or longitude), y, z, the pixel, the photo, and perhaps a name."""
+    """OpenDroneMap's: a frame, then x (or longitude), y, z, the pixel, the photo, and optionally a name."""
     lines = read_words(file)
     if not lines:
         raise _invalid(file.name, "is empty.")
@@ -145,7 +145,7 @@ def _of_odm(file: Path) -> tuple[list[_Row], bool, int | None]:
 
 
 def _of_csv(file: Path) -> tuple[list[_Row], bool, int | None]:
-    """A header that names the columns; above it perhaps a line with the frame of x, y, z."""
+    """A header that names the columns; optionally above it a line with the frame of x, y, z."""
     lines = read_text(file).splitlines()
     epsg = next((int(n) for line in lines[:2] for n in re.findall(r"EPSG:\s*(\d{4,6})", line, re.I)), None)
     table = read_table(file.name, lines, _TITLES, lambda found: "name" in found)

@@ -1,4 +1,4 @@
-"""The scale of a set by a distance that somebody measured: between two photos, or two points of its world."""
+"""The scale of a set by a measured distance: between two photos, or two points of its world."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class KnownDistance:
 
     @classmethod
     def of(cls, text: str, dataset: Dataset) -> KnownDistance | None:
-        """What the option says; None where it is empty.
+        """The distance that the option states; None where it is empty.
 
         Raises:
             InputError: ``known_distance_invalid``.

@@ -57,7 +57,7 @@ def position_priors(dataset: Dataset) -> PositionPriors | None:
 
 
 def _tags(dataset: Dataset) -> dict[int, MeasuredPlace]:
-    """What photos say themselves, by frame."""
+    """The positions in the photos' own metadata, by frame."""
     return {i: tag for i, f in enumerate(dataset.frames) if (tag := read_geotag(f.path, f.name)) is not None}
 
 

@@ -39,7 +39,7 @@ _ODM_ACCURACY = 7
 
 @dataclass(frozen=True)
 class PositionTable:
-    """What a source says of places.
+    """The places that a source states.
 
     Attributes:
         source: for messages: the file's name.
@@ -57,13 +57,13 @@ class PositionTable:
 
 
 def files_called(root: Path, names: Sequence[str]) -> list[Path]:
-    """The files in the folder ``root`` that are called so, whatever their case, in this order."""
+    """The files in the folder ``root`` with these names, in any case, in this order."""
     files = {path.name.lower(): path for path in sorted(root.iterdir()) if path.is_file()}
     return [files[name] for name in names if name in files]
 
 
 def position_files(root: Path) -> list[Path]:
-    """Those that are called as tables of positions."""
+    """The files that are named as tables of positions."""
     return files_called(root, POSITION_FILES)
 
 
@@ -110,7 +110,7 @@ def read_position_table(file: Path) -> PositionTable:
 
 
 def _geo_txt(file: Path) -> PositionTable:
-    """OpenDroneMap's: a frame, then names, x (or longitude), y (or latitude), perhaps height, angles and accuracies."""
+    """OpenDroneMap's: a frame, then names, x (or longitude), y (or latitude), optional height, angles, accuracies."""
     (header, frame), *told = read_words(file)
     for where, cells in told:
         if len(cells) < 3:
@@ -138,8 +138,8 @@ def _flat_notes(places: Sequence[str]) -> tuple[str, ...]:
 def frame_of(header: str, rows: Sequence[Sequence[str]], where: str) -> tuple[bool, float, int | None]:
     """Whether the first line of a geo.txt names a frame of degrees, else its metres per unit, and EPSG's number.
 
-    It is ``EPSG:n``, ``WGS84 UTM 32N`` or a string of PROJ. Of the geographic ones among EPSG's numbers few are known
-    here: others are those whose coordinates are all small, as nobody takes photos at a projection's origin.
+    It is ``EPSG:n``, ``WGS84 UTM 32N`` or a string of PROJ. Few of EPSG's geographic frames are known here. Any other
+    is taken as geographic if all coordinates are small, as nobody takes photos at a projection's origin.
     """
     if found := re.fullmatch(r"\s*EPSG:\s*(\d{4,6})\s*", header, re.I):
         number = int(found[1])

@@ -1,8 +1,8 @@
 """Poses and lenses that a network predicted: of VGGT, Depth Anything 3, DUSt3R and MASt3R.
 
 The first two write them themselves (VGGT's demo_gradio.py predictions.npz, Depth Anything 3 exports/npz/results.npz):
-world to camera. Of the others people save what ``get_im_poses()``, ``get_focals()`` and the like give: camera to world.
-None names photos, and all lenses are those of the scaled pictures; a principal point lies in their middle.
+world to camera. For the others, people save what ``get_im_poses()``, ``get_focals()`` and the like give: camera to
+world. None names photos, and all lenses are those of the scaled pictures; a principal point lies in their middle.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ class _Arrays:
         return tuple(self.file.with_name(f"{name}.npy") for name in self.shapes)
 
     def picture_size(self, centre: Array | None) -> Size | None:
-        """Width and height of the pictures that the lenses are of: as of depths or pictures, else twice the centre."""
+        """Width and height of the pictures that the lenses are for: from depths or pictures, else twice the centre."""
         name = self.name_of(_DEPTHS + _PICTURES)
         if name is not None:
             return _size(self.shapes[name])

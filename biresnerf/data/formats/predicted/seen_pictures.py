@@ -40,7 +40,7 @@ class Margin(NamedTuple):
 def seen_by_vggt(photo: Size, picture: Size, margin: Margin) -> Seen:
     """VGGT's: 518 px wide, and cropped to as many in height.
 
-    Its picture shows by its margins where it was padded to a square instead: black before scaling, or white after.
+    Margins show that a picture was padded to a square instead: black before scaling, or white after.
     """
     width, height = photo
     if margin.black:

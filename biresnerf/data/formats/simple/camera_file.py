@@ -30,7 +30,7 @@ CameraFile: TypeAlias = tuple[Camera | LensOf | None, NDArray[np.float64], tuple
 def read_camera_file(root: Path, photo_folders: Sequence[str] = ()) -> CameraFile:
     """The lens of the images, by their header; ``cam_from_pose`` [4, 4]; and the files that were read.
 
-    The lens is None where there is no such file. ``cam_from_pose`` is where the camera sits on what the poses are of.
+    The lens is None where there is no such file. ``cam_from_pose`` mounts the camera on the body that has the poses.
 
     camera.json has the keys of a transforms.json's top (``w``, ``h``, ``fl_x``, ``k1``, ...), cameras.txt is COLMAP's
     with one camera, calib.txt is KITTI's: of the camera that the folder of the photos (image_2/) is called after,

@@ -1,6 +1,6 @@
 """``poses.csv``: one row an image, for spreadsheets and scripts: where it was taken, and how exactly that is known.
 
-Tables of others are read, too, if their head names an image, a position and a quaternion: camera to world, OpenCV axes.
+Other tables are read, too, if their header names an image, a position and a quaternion: camera to world, OpenCV axes.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""``poses.json``: every image's pose before and after, how exact it is, its lens and flags, in one file of ours.
+"""``poses.json``: every image's pose before and after, how exact it is, its lens and flags, in our own format.
 
 With the COLMAP model it loses nothing, so the other formats of a result can be made from the two later.
 """

@@ -261,7 +261,7 @@ def matched(trajectory: Trajectory, names: Sequence[str], root: Path) -> tuple[d
 
 
 def _is_trajectory(file: Path) -> bool:
-    """Whether it is called as trajectories are; of names that say less, whether the first line is one's."""
+    """Whether the file is named as a trajectory; for vaguer names, whether its first line is one of a trajectory."""
     sequence = file.stem.isdecimal()  # KITTI's are called by numbers
     if not file.is_file() or not (sequence or file.stem == "pose"):
         return file.is_file()

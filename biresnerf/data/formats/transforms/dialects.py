@@ -1,4 +1,4 @@
-"""Dialects of transforms.json that say the same by other keys, put into nerfstudio's; keys of unknown meaning refused.
+"""Dialects of transforms.json, converted to nerfstudio's keys; keys of unknown meaning are refused.
 
 - NeuS2 (src/nerf_loader.cu and nerf_loader.h of 19reborn/NeuS2): ``from_na`` means OpenCV axes, and
   ``intrinsic_matrix`` of a frame is its lens, unless a focal length is given.
@@ -37,7 +37,7 @@ _LEAST_SKEW_PX = 0.5
 
 
 def plain_document(path: Path) -> tuple[dict[str, Any], list[str]]:
-    """The document of the file by nerfstudio's keys, and notes on what was put into them.
+    """The document of the file with nerfstudio's keys, and notes on what was converted.
 
     Raises:
         InputError: a code of `read_json`, ``pose_file_invalid`` or ``intrinsics_invalid``.
@@ -111,7 +111,7 @@ def _has_focal(place: dict[str, Any]) -> bool:
 def _put_matrix_into_keys(place: dict[str, Any], where: str) -> None:
     """Replaces an intrinsic matrix of a frame, or of the file, by keys, unless a focal length is given.
 
-    So does it with the four numbers fx, fy, cx, cy: in a list, or under these names.
+    The same for the four numbers fx, fy, cx, cy: in a list, or under these names.
     """
     for short, key in (("fx", "fl_x"), ("fy", "fl_y")) if not _has_focal(place) else ():
         if place.get(short) is not None:

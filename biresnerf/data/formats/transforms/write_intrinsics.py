@@ -18,7 +18,7 @@ _COLMAPS = ("FULL_OPENCV", "THIN_PRISM_FISHEYE", *SHAPES)
 
 
 def family(camera: Camera) -> str:
-    """``camera_model`` of the file; one of `_COLMAPS`, which nerfstudio does not know, where nothing less will do."""
+    """``camera_model`` of the file; one of `_COLMAPS`, which nerfstudio does not know, where no simpler one will do."""
     if camera.model in _COLMAPS or camera.panorama:
         return camera.model
     return "OPENCV_FISHEYE" if camera.full().fisheye else "OPENCV"
@@ -48,7 +48,7 @@ def ngp_coefficients(lens: FullParameters) -> tuple[str, ...]:
 def listed_frames(
     refined: RefinedSet, lenses: Sequence[dict[str, Any]], more: Sequence[dict[str, Any]] | None = None
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """What a file in the set's own world says of all frames, the one lens, and of each; ``more`` stands in each."""
+    """The entries of a file in the set's own world: a single lens for all frames, and each frame with its ``more``."""
     shared = lenses[0] if len(lenses) == 1 else {}
     matrices = file_from_world_from_cam(refined.world_from_cam, np.eye(4), 1.0)
     return shared, [

@@ -130,7 +130,7 @@ def _with_intrinsics(document: dict[str, Any], dataset: Dataset) -> dict[str, An
 
 
 def _write_found_intrinsics(document: dict[str, Any], dataset: Dataset) -> None:
-    """Intrinsics that the input does not give, or others: in the frame that says its own, else at the top."""
+    """Write intrinsics that the input lacks or that changed: in frames that have their own, else at the top."""
     shared = {
         frame.camera
         for frame, row in zip(dataset.frames, document["frames"], strict=True)
