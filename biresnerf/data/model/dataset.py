@@ -94,9 +94,9 @@ class Dataset:
         warnings: what the user should know about how it was read.
         intrinsics_sources: who found each camera's intrinsics; empty where the user gave them all.
         faults: what failed on our side, so that evidence is missing that the photos may hold.
-        body_offset: what all given poses lacked, and have now; None where nothing was found.
-        positions: where the photos were taken, once that was asked; None where nothing says so.
-        control: points on the ground that were measured, once that was asked; None where there are none.
+        body_offset: the offset that all given poses shared and that was removed; None where none was found.
+        positions: where the photos were taken, once looked up; None where it is unknown.
+        control: measured points on the ground, once looked up; None where there are none.
         cut: where frames are views of panoramas; None where there are none.
     """
 
@@ -130,9 +130,9 @@ class Dataset:
         return tuple(Path(os.path.relpath(frame.path, self.root)).as_posix() for frame in self.frames)
 
     def called(self, name: str) -> list[int]:
-        """The frames that the user calls so: by the input's name or by the path relative to its root.
+        """The frames of this name: the input's name, or the path relative to its root.
 
-        These are all views of a panorama that is called so. Empty where there is no such image.
+        For the name of a panorama, all its views. Empty where there is no such image.
         """
         if name in self._row_of:
             return [self._row_of[name]]

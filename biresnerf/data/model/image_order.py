@@ -55,7 +55,7 @@ def names_of_poses(
 
 
 def _path_length(poses: Sequence[NDArray[np.float64] | None]) -> float:
-    """Along the camera centres, in their spread, and the turns of the viewing axes."""
+    """Length of the path along the camera centres, in their spread, plus the turns of the viewing axes."""
     known = np.array([pose for pose in poses if pose is not None]).reshape(-1, 4, 4)
     if len(known) < LEAST_POSED:
         return 0.0

@@ -13,7 +13,7 @@ class PositionPriors:
     """Where photos were taken, as measured.
 
     Attributes:
-        source: what says so, for messages.
+        source: where the positions come from, for messages.
         rows: int64 [m], the frames that have a position.
         positions_m: float64 [m, 3]: along east, north and up from the origin, or in the source's own frame.
         accuracy_m: float64 [m, 3], standard deviations along the axes; NaN where they are not said.
@@ -33,13 +33,13 @@ class PositionPriors:
 
     @property
     def turned(self) -> NDArray[np.bool_]:
-        """Which of them [m] have a rotation."""
+        """Which positions [m] have a rotation."""
         if self.rotations is None:
             return np.zeros(len(self.rows), dtype=np.bool_)
         return np.asarray(np.isfinite(self.rotations).all((1, 2)))
 
     def of(self, frames: NDArray[np.bool_]) -> PositionPriors:
-        """Those of these frames [n] alone, with the same origin."""
+        """The positions of these frames [n] alone, with the same origin."""
         kept = frames[self.rows]
         return replace(
             self,
@@ -81,7 +81,7 @@ class ControlPoints:
         return self.seen_in(frames[self.image])
 
     def seen_in(self, observations: NDArray[np.bool_]) -> ControlPoints:
-        """Those of these observations [m] that leave a point two photos."""
+        """These observations [m] alone, of points that two photos then still show."""
         count = np.bincount(self.point[observations], minlength=len(self.names))
         kept = observations & (count >= 2)[self.point]
         points, number = np.unique(self.point[kept], return_inverse=True)

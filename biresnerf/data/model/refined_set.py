@@ -44,7 +44,7 @@ class Landmark(NamedTuple):
 
     @property
     def seen(self) -> dict[int, tuple[int, list[float]]]:
-        """By the image's row, for programs in which a view sees a point once: the first feature."""
+        """The first feature by the image's row, for programs in which a view sees a point once."""
         seen: dict[int, tuple[int, list[float]]] = {}
         for row, feature, xy in self.features:
             seen.setdefault(row, (feature, xy))
@@ -65,7 +65,7 @@ class RefinedImage:
         flags: notable facts about it: ``fixed``, ``held_out``, ``repaired``, ...
         path: the file; None where it is not known.
         orientation, levels: as `biresnerf.data.model.dataset.Frame` has them.
-        uncertainty: of the pose; None where nothing was said of it.
+        uncertainty: of the pose; None where it is not known.
     """
 
     name: str
@@ -122,7 +122,7 @@ class RefinedSet:
 
     @property
     def cam_from_world(self) -> NDArray[np.float64]:
-        """The refined poses the other way round, float64 [n, 4, 4]."""
+        """The inverses of the refined poses, float64 [n, 4, 4]."""
         return rigid_inverse(self.world_from_cam)
 
     def camera_of(self, index: int) -> Camera:
@@ -143,7 +143,7 @@ class RefinedSet:
             yield Landmark(number, xyz, rgb, shown)
 
     def of_body(self, offset: BodyOffset) -> RefinedSet:
-        """The set with the poses of what carries the camera; without points, rigs and bounds of the cameras."""
+        """The set with the poses of the camera's body; without points, rigs and bounds of the cameras."""
         cam_from_body = rigid_inverse(offset.body_from_cam)
         images = tuple(
             replace(

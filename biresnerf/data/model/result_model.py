@@ -80,7 +80,7 @@ def model_at_poses(
 
     Images that did not change (``changed`` [n] false) keep their numbers to the bit. Images that the model did not
     have get new ids behind the last ones, and a frame each where the model has frames. Points are the given ones: the
-    caller is to put them right (`biresnerf.data.points.refined_points`).
+    caller must correct them (`biresnerf.data.points.refined_points`).
 
     Args:
         given: the caller's model.

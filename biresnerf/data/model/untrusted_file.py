@@ -53,7 +53,7 @@ def read_text(path: Path, most_bytes: int = MAX_TEXT_BYTES) -> str:
 
 
 def read_words(path: Path) -> list[tuple[str, list[str]]]:
-    """The place of each line that says something, and its words; lines that begin with # say nothing.
+    """The place and the words of each line with content; lines that begin with # are comments.
 
     Raises:
         InputError: as `read_text` does.
@@ -84,7 +84,7 @@ class Table:
 
     Attributes:
         head: the place of the line that names the columns.
-        columns: where those are whose meaning is known.
+        columns: where the columns of known meaning are.
         rows: place and cells of those below, stripped; blank lines and comments are left out.
     """
 

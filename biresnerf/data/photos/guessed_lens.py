@@ -69,9 +69,9 @@ def guess_note(source: IntrinsicsSource) -> str:
 
 
 def with_shared_predictions(dataset: Dataset) -> Dataset:
-    """The set with one SIMPLE_RADIAL camera for photos of a size and a lens by their EXIF, of those predicted.
+    """The set with one SIMPLE_RADIAL camera in place of predicted ones of the same size and EXIF lens.
 
-    It has their medians. Predictions that differ as much as guesses do are of lenses that differ.
+    It has their medians. Predictions that differ as much as guesses do are of different lenses.
     """
     alike: dict[tuple[int, int, tuple[str, ...]], list[int]] = defaultdict(list)
     for row, frame in enumerate(dataset.frames):
@@ -96,7 +96,7 @@ def with_shared_predictions(dataset: Dataset) -> Dataset:
 
 
 def refuse_other_units(camera: Camera, where: str) -> None:
-    """Raises InputError ``intrinsics_invalid`` for a lens that sees more than one can, as other units make it."""
+    """Raises InputError ``intrinsics_invalid`` for a lens wider than possible, as wrong units make it."""
     full, w, h = camera.full(), camera.width, camera.height
     hint = (
         "Give the focal length and the principal point in pixels: shares of the photo are multiplied by its width "
@@ -146,7 +146,7 @@ def _view_deg(full: FullParameters, width: int, height: int) -> float:
 
 
 def exif_focal_px(header: ImageHeader) -> float | None:
-    """Focal length in pixels of the stored picture by its EXIF; None where it says none, or none that a lens has.
+    """Focal length in pixels of the stored picture by its EXIF; None where it is absent or impossible.
 
     From the focal length on 35 mm film, of equal diagonal (CIPA DCG-001); or from the one in mm and the sensor's
     resolution, where that agrees or stands alone.

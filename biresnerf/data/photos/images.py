@@ -186,10 +186,10 @@ def load_by_content(
     background: Background,
     on_photo: Callable[[int], object] = lambda _done: None,
 ) -> ImageSet:
-    """As `load_images`, but with larger photos where a thing before a background fills little of them.
+    """As `load_images`, but with larger photos where an object before a background fills little of them.
 
-    It is `CONTENT_SHARE` of ``max_size`` long then, as far as photos of `LARGER_MOST` times that size, or the files,
-    show it.
+    The object is then `CONTENT_SHARE` of ``max_size`` long, as far as photos of `LARGER_MOST` times that size, or the
+    files, show it.
     """
     images = load_images(dataset, max_size, background, on_photo)
     boxes = [box for i in range(len(images)) if (box := images.content_box(i)) is not None]

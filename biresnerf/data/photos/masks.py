@@ -61,7 +61,7 @@ def _called(root: Path, image: Path, name: str) -> Iterator[Path]:
 
 
 def mask_notes(root: Path, frames: Sequence[Frame]) -> list[str]:
-    """How many photos have a mask, and which pictures in folders called so are none."""
+    """How many photos have a mask, and which pictures in mask folders are none."""
     used = {frame.mask.absolute() for frame in frames if frame.mask is not None}
     masked = sum(frame.mask is not None for frame in frames)
     notes = [f"masks were found for {masked} of {len(frames)} images"] if masked else []

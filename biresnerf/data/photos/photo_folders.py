@@ -1,4 +1,4 @@
-"""Where the photos of a set lie, and what else lies there that is no photo that is read."""
+"""Where the photos of a set lie, and what else lies there that is not read."""
 
 from __future__ import annotations
 
@@ -56,9 +56,9 @@ def photos_beside(root: Path, folders: Sequence[str] = ()) -> dict[str, Path]:
     """The photos beside poses, by path with forward slashes; empty where there are none, or none can be chosen.
 
     Those in the first of ``folders`` that has some, which the poses' program uses; else those of `images_beside`; else
-    those in the one other folder that has some; of several, in the first that is called as folders of photos usually
-    are (rgb/, color/, image_2/), or in all of them where only a number tells their names apart (cam0/, cam1/). Of
-    images_4/ and images_8/, which hold smaller copies, the first counts.
+    those in the one other folder that has some; of several, in the first with a usual name for a folder of photos
+    (rgb/, color/, image_2/), or in all of them where their names differ only by a number (cam0/, cam1/). Of images_4/
+    and images_8/, which hold smaller copies, the first counts.
     """
     for name in folders:
         paths = images_below(root / name)
@@ -115,9 +115,9 @@ def _bare(name: str) -> str:
 
 
 def with_named(files: dict[str, Path], root: Path, names: Iterable[str]) -> dict[str, Path]:
-    """The photos of ``root`` or its images/, with those that poses name though they are called as maps of others are.
+    """The photos of ``root`` or its images/, with those that poses name although they are named like maps.
 
-    One that was preferred to it for its name is no photo then.
+    A photo that was preferred to one of these for its name is then left out.
     """
     asked, limit, files = set(names), root.resolve(), dict(files)
     key_of = {path: key for key, path in files.items()}
@@ -155,7 +155,7 @@ def images_beside(root: Path) -> dict[str, Path]:
 
 
 def visible(folder: Path) -> list[Path]:
-    """What a folder holds but hidden files, sorted. Raises InputError ``input_unreadable``."""
+    """What a folder holds, without hidden files, sorted. Raises InputError ``input_unreadable``."""
     try:
         return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     except OSError as error:
@@ -170,7 +170,7 @@ def visible(folder: Path) -> list[Path]:
 def images_in(folder: Path) -> list[Path]:
     """The photos in ``folder`` itself, each once, numbers in their names compared as numbers.
 
-    Masks and depth maps that are called so are none.
+    Files named as masks or depth maps are left out.
     """
     return _once([path for path in visible(folder) if is_photo_name(path.name) and path.is_file()])
 
@@ -181,13 +181,13 @@ def images_below(folder: Path) -> list[Path]:
 
 
 def _once(paths: Sequence[Path]) -> list[Path]:
-    """The photos but maps of them and those that are there in a kind that more programs read."""
+    """The photos without maps of them, and without those also stored in a kind that more programs read."""
     photos = set(paths) - maps_among(paths)
     return sorted(photos - doubled(photos).keys(), key=lambda path: natural_key(path.as_posix()))
 
 
 def maps_among(paths: Iterable[Path]) -> set[Path]:
-    """Pictures that are called as a map or a small copy of a photo beside them: r_0_depth_0001.png beside r_0.png.
+    """Pictures named as a map or a small copy of a photo beside them: r_0_depth_0001.png beside r_0.png.
 
     The photo has the same numbers in its name, or the first of them; names without numbers have the same other words.
     """
@@ -207,7 +207,7 @@ def _words(name: str) -> list[str]:
 
 
 def _apart(stem: str) -> tuple[int | str, ...]:
-    """What tells a name from others of its kind: its numbers, else its words."""
+    """What distinguishes a name from others of its kind: its numbers, else its words."""
     return tuple(map(int, re.findall(r"\d+", stem))) or tuple(w for w in _words(stem) if w not in _MAPS)
 
 
@@ -271,7 +271,7 @@ def _unread_kind(path: Path) -> str | None:
 
 
 def left_out_notes(folder: Path, used: Iterable[Path] = ()) -> tuple[str, ...]:
-    """A note for each kind of picture in or below ``folder`` that is not read; those ``used`` are never meant."""
+    """A note for each kind of picture in or below ``folder`` that is not read, without those ``used``."""
     taken = {path.absolute() for path in used}
     unread = {
         kind: left
@@ -328,7 +328,7 @@ def refuse_no_images(files: dict[str, Path], root: Path) -> None:
 
 
 def _seen(path: Path) -> str:
-    """A file's name; of a folder also what kinds of files lie in it."""
+    """A file's name; for a folder also what kinds of files lie in it."""
     if not path.is_dir():
         return path.name
     kinds = Counter(one.suffix.lower() or "no extension" for one in islice(_files_below(path), _MOST_ENTRIES))

@@ -23,7 +23,7 @@ def straightened(picture: NDArray[np.uint8], shear: float) -> NDArray[np.uint8]:
 
 
 def straightened_mask(counts: NDArray[np.bool_], shear: float) -> NDArray[np.bool_]:
-    """Which pixels count, bool [h, w], of a picture whose rows are moved: those with no pixel from outside either."""
+    """Which pixels count, bool [h, w], of a picture whose rows are moved: none with a pixel from outside."""
     if not shear:
         return counts
     height, width = counts.shape

@@ -36,7 +36,7 @@ class LocatedPoints:
 
     Attributes:
         metres_from_world: the similarity that carries the control points to their coordinates.
-        error_m: [p, 3], where the points are by the cameras less where they were measured, along the axes.
+        error_m: [p, 3], the points' positions by the cameras minus the measured ones, along the axes.
         error_px: [p], root mean square over a point's photos of how far it appears from its mark.
         far_off: bool [p], see `far_off`.
     """
@@ -48,7 +48,7 @@ class LocatedPoints:
 
 
 def far_off(apart_m: Array, px_m: Array, accuracy_m: Array) -> NDArray[np.bool_]:
-    """Points [p] whose coordinates or marks are wrong by all that the others show.
+    """Mask [p] of points whose coordinates or marks are wrong, judging by the others.
 
     Args:
         apart_m: how far each is from where photos show it.
@@ -110,7 +110,7 @@ def located(points: ControlPoints, world_from_cam: Array, cameras: Sequence[Came
 def metres_from_world(
     dataset: Dataset, world_from_cam: Array, placed: NDArray[np.bool_] | None = None
 ) -> Similarity | None:
-    """What carries the set's cameras at poses [n, 4, 4] to measured places: control points, else positions of cameras.
+    """The similarity from cameras at poses [n, 4, 4] to measured places: control points, else cameras' positions.
 
     None where neither tell. Only cameras that are `placed` [n] count.
     """

@@ -1,4 +1,4 @@
-"""Tracks: points of the scene, each with its features in the photos that show it. No pose has a say in them."""
+"""Tracks: points of the scene, each with its features in the photos that show it. They depend on no pose."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ class Tracks:
     xy: NDArray[np.float64]
 
     def __len__(self) -> int:
-        """How many observations."""
+        """Number of observations."""
         return len(self.point)
 
     @property
     def points(self) -> int:
-        """How many points."""
+        """Number of points."""
         return int(self.point[-1]) + 1 if len(self.point) else 0
 
     @property
@@ -69,7 +69,7 @@ class Tracks:
     def of(cls, point: NDArray[Any], image: NDArray[Any], xy: NDArray[Any]) -> Tracks | None:
         """From observations in the order of their points, numbered in any way; None where no point has two of them.
 
-        In the precision of `kept`, so that a resumed run has the same.
+        They have the precision of `kept`, so that a resumed run has the same.
         """
         seen = np.unique(point, return_inverse=True, return_counts=True)
         several = seen[2][seen[1]] >= 2
@@ -80,7 +80,7 @@ class Tracks:
         return cls(numbers, np.asarray(image, np.int64)[several], as_kept)
 
     def where(self, observations: NDArray[np.bool_]) -> Tracks | None:
-        """Those observations [m] of points that keep two at least; None of none."""
+        """These observations [m], of points that keep two at least; None if there are none."""
         return Tracks.of(self.point[observations], self.image[observations], self.xy[observations])
 
     def left_out(self, share: float = LEFT_OUT, seed: int = 0) -> NDArray[np.bool_]:

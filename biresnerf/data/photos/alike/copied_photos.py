@@ -46,9 +46,9 @@ _DECODERS = 4
 def without_copies(dataset: Dataset, keep: Sequence[str] = ()) -> Dataset:
     """The set without photos whose pictures are those of others, and a note that names them.
 
-    A copy's matches with its original fit exactly, and say nothing of where anything is. Of the same pictures that
-    with a pose stays, then the larger one, then the earlier. Copies stay where without them too few photos would be
-    left, and photos of the names ``keep`` in any case.
+    A copy's matches with its original fit exactly, and say nothing of where anything is. Of equal pictures the one with
+    a pose stays, then the larger one, then the earlier. Copies stay where without them too few photos would be left,
+    and photos of the names ``keep`` in any case.
     """
     copies = _stored_alike(dataset, keep)
     again = _compressed_again(dataset, [f for f in dataset.frames if f.name not in copies], keep)
@@ -69,7 +69,7 @@ def without_copies(dataset: Dataset, keep: Sequence[str] = ()) -> Dataset:
 
 
 def _stored_alike(dataset: Dataset, keep: Sequence[str]) -> dict[str, str]:
-    """Photos whose pictures are stored as another's, by name, with that one."""
+    """Photos whose pictures are stored byte for byte as another's, by name, with that one."""
     begins = {frame.name: _picture_begins(frame.path) for frame in dataset.frames}
     size = {frame.name: frame.path.stat().st_size - begins[frame.name] for frame in dataset.frames}
     several = Counter(size.values())
@@ -164,13 +164,13 @@ def _picture(frame: Frame) -> _Picture | None:
 
 
 def _means(values: NDArray[np.float32], side: int) -> NDArray[np.float32]:
-    """Of squares of so many values a side."""
+    """Means over squares of so many values a side."""
     rows, columns = (size // side for size in values.shape)
     return np.asarray(values.reshape(rows, side, columns, side).mean((1, 3)))
 
 
 def _one_view(picture: _Picture, other: _Picture, extent: float) -> bool:
-    """Whether the input does not say that the two were taken from different places, as of a vase that turned."""
+    """Whether the input allows that the two show one view; not if it has different poses, as for a vase that turned."""
     a, b = picture.frame.world_from_cam, other.frame.world_from_cam
     if a is None or b is None:
         return True
@@ -179,7 +179,7 @@ def _one_view(picture: _Picture, other: _Picture, extent: float) -> bool:
 
 
 def _extent(dataset: Dataset) -> float:
-    """Of the box around the cameras, its longest side."""
+    """The longest side of the box around the cameras."""
     places = [frame.world_from_cam[:3, 3] for frame in dataset.frames if frame.world_from_cam is not None]
     return float(np.ptp(np.array(places), axis=0).max()) if places else 0.0
 
@@ -205,7 +205,7 @@ def _other_poses(dataset: Dataset, copies: Mapping[str, str]) -> str:
 
 
 def _picture_begins(path: Path) -> int:
-    """Where a JPEG's picture begins, behind metadata that programs add or change; 0 in other files."""
+    """Where a JPEG's picture begins, after metadata that programs add or change; 0 in other files."""
     with path.open("rb") as file:
         if file.read(2) != b"\xff\xd8":
             return 0

@@ -1,4 +1,4 @@
-"""How alike whole photos are: what says, without any features, which of them may show the same."""
+"""How alike whole photos are: shows, without any features, which of them may depict the same."""
 
 from __future__ import annotations
 

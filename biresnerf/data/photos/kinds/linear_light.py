@@ -30,7 +30,7 @@ _MODES = {1: "L", 3: "RGB", 4: "RGBA"}
 def eight_bit(light: NDArray[np.floating[Any]], name: str) -> NDArray[np.uint8]:
     """Linear light [h, w, c] as sRGB colours, uint8. Of 2 or 4 channels the last is opacity: colours are premultiplied.
 
-    What is no number is black.
+    NaN is black.
 
     Raises:
         InputError: ``image_format_unsupported``: most pixels are beyond white, so 1 is not white in this file.

@@ -67,7 +67,7 @@ def image_suffixes() -> tuple[str, ...]:
 
 
 def install_hint(path: Path) -> str:
-    """How to make a picture readable that was not, where something is missing for it; else nothing."""
+    """What to install to read a picture that could not be read; empty if nothing is missing."""
     kind = KIND_OF.get(path.suffix.lower()) or _by_content(path)
     if kind is not None and not is_readable(kind):
         return f"Run `{INSTALL}`, which reads {kind.name}."

@@ -1,4 +1,4 @@
-"""What other libraries decode, as an image that Pillow opens: the size at once, the pixels on request."""
+"""Files that other libraries decode, as images that Pillow opens: the size at once, the pixels on request."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from biresnerf.errors import InputError
 class PictureFile(ImageFile.ImageFile):
     """A Pillow image whose subclass measures the file when it is opened, and decodes it when it is loaded.
 
-    Errors of other libraries come out as those that Pillow raises on damaged files: SyntaxError on opening, which lets
+    Errors of other libraries are raised as those of Pillow for damaged files: SyntaxError on opening, which lets
     the next format have its try, and OSError on loading.
     """
 

@@ -55,7 +55,7 @@ class RawFile(PictureFile):
         return developed
 
     def getexif(self) -> Image.Exif:
-        """What the RAW file itself has, else its preview."""
+        """The EXIF of the RAW file itself, else of its preview."""
         exif = self._own_tables()
         if exif is None or not (exif.get_ifd(EXIF_IFD) or exif.get_ifd(GPS_IFD)):
             exif = self._preview or exif or Image.Exif()
@@ -76,7 +76,7 @@ class RawFile(PictureFile):
 
 
 def _preview(raw: Any) -> Image.Exif | None:
-    """EXIF of the JPEG inside, where makers put it whose files are no TIFF (CR3, RAF)."""
+    """EXIF of the JPEG inside, where files that are not TIFF (CR3, RAF) have it."""
     import rawpy
 
     try:

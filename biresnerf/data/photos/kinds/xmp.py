@@ -10,7 +10,7 @@ _KEYS = ("xmp", "XML:com.adobe.xmp")  # of JPEG, WebP, TIFF and HEIC; of PNG
 
 
 def xmp(image: Image.Image) -> bytes:
-    """That of an opened image, which is not decoded yet; empty where there is none."""
+    """The XMP of an opened image, which is not decoded yet; empty where there is none."""
     texts = (image.info.get(key, b"") for key in _KEYS)
     return b"".join(t.encode() if isinstance(t, str) else t for t in texts if isinstance(t, str | bytes))
 

@@ -1,1 +1,1 @@
-"""Photos that show all directions: told by their metadata, and cut into views."""
+"""Photos that show all directions: detected by their metadata, and cut into views."""

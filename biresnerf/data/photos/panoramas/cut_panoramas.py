@@ -40,7 +40,7 @@ _QUALITY = 95
 
 
 def called_panoramas(dataset: Dataset) -> Dataset:
-    """The set with every photo twice as wide as high, and without a given lens, a panorama, whatever it says."""
+    """The set with every photo that is twice as wide as high and has no given lens treated as a panorama."""
     cameras = tuple(
         panorama_camera(camera.width, camera.height, "")
         if camera.width == 2 * camera.height and dataset.source_of_intrinsics(index) != "given"
@@ -129,7 +129,7 @@ def place_in_view(
 
 
 def _face_camera(panorama: Camera) -> Camera:
-    """As many pixels around as the panorama has."""
+    """The camera of a face, with as many pixels around as the panorama has."""
     side = panorama.width // 4
     return Camera("PINHOLE", side, side, (side / 2, side / 2, side / 2, side / 2))
 
@@ -173,7 +173,7 @@ def _save(picture: Image.Image, path: Path) -> None:
 
 
 def _around(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The panorama with a column of its other side at either side."""
+    """The panorama with a column of the opposite side added at either side."""
     return np.concatenate([picture[:, -1:], picture, picture[:, :1]], axis=1)
 
 

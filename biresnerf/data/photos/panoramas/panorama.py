@@ -1,4 +1,4 @@
-"""Photos that show all directions (equirectangular): told by their metadata."""
+"""Photos that show all directions (equirectangular): detected by their metadata."""
 
 from __future__ import annotations
 

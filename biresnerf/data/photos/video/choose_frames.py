@@ -1,4 +1,4 @@
-"""Which frames of a video are worth having: sharp ones, evenly spread over the camera's way and not over time."""
+"""Which frames of a video are worth having: sharp ones, evenly spread over the camera's path and not over time."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class FrameWatch:
         self._before = 0.0
 
     def look(self, frame: NDArray[np.uint8]) -> None:
-        """The next frame."""
+        """Look at the next frame."""
         values = frame.astype(np.float32)
         self.sharpness.append(_laplacian(values))
         blocks = _blocks(_halved(values))
@@ -52,8 +52,8 @@ def choose_frames(
 ) -> list[int]:
     """Indices of ``count`` of the frames [n], or of fewer where there are no more, in their order.
 
-    The camera's way is cut into stretches of equal length, and of each the sharpest frame is taken, one near the middle
-    before one of the same sharpness at the edge. Where the camera stood still, time takes the way's place.
+    The camera's path is cut into stretches of equal length, and from each the sharpest frame is taken, one near the
+    middle before one of the same sharpness at the edge. Where the camera stood still, time replaces the path.
     """
     way = np.maximum.accumulate(travelled)
     if way[-1] < _STANDS_STILL:

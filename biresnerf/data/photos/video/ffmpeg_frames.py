@@ -1,6 +1,6 @@
 """The frames of a video, one after the other, as FFmpeg decodes them in a process of its own.
 
-Turned as the video's metadata say. A video is a stranger's file: FFmpeg gets one demuxer, that of the file's name, no
+Turned as the video's metadata say. Videos are untrusted: FFmpeg gets one demuxer, that of the file's name, no
 protocol but files, a limit on pixels, and ends with the caller.
 """
 
@@ -58,8 +58,8 @@ class FrameStream:
         """uint8 [h, w] or [h, w, 3].
 
         Raises:
-            InputError: ``video_unreadable``, where no frame can be decoded; ``video_too_long``. Of a damaged video the
-                frames before the damage come.
+            InputError: ``video_unreadable``, where no frame can be decoded; ``video_too_long``. A damaged video yields
+                the frames before the damage.
         """
         with subprocess.Popen(self._command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
             assert process.stdout is not None, "started with a pipe"

@@ -71,7 +71,7 @@ def _source(video: Path) -> dict[str, Any]:
 
 
 def _kept(folder: Path, video: Path, share: int | None) -> list[Path] | None:
-    """The frames written before, if they are of this very file, and as many as are asked for."""
+    """The frames written before, if they are of this very file, and as many as requested."""
     try:
         told = json.loads((folder / CHOSEN).read_text("utf-8"))
         same = told["of"] == _source(video) and share in (None, told["asked"])
