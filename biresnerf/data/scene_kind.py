@@ -1,4 +1,4 @@
-"""What a run does otherwise in open scenes, whose photos show surroundings instead of a background."""
+"""What a run does differently in open scenes, whose photos show surroundings instead of a background."""
 
 from __future__ import annotations
 

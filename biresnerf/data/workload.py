@@ -1,4 +1,4 @@
-"""How much work a run has before it, in the units of its forecast: from counts and sizes alone, without torch."""
+"""How much work a run has to do, in the units of its forecast: from counts and sizes alone, without torch."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Workload:
     Attributes:
         amounts: work in each phase, in its unit.
         step_weights: units of work in a step of either stage.
-        share: of the steps asked for, how many will be taken.
+        share: the share of the requested steps that will be taken.
     """
 
     amounts: Mapping[Phase, float]
@@ -73,7 +73,7 @@ class Workload:
 
 
 def workload(dataset: Dataset, options: ResolvedOptions, *, kind: SceneKind, adjusts: bool) -> Workload:
-    """All of a run, as far as it is known before its features are.
+    """All work of a run, as far as known before its features are.
 
     Args:
         kind: of the scene.
@@ -119,7 +119,7 @@ def step_weights(options: ResolvedOptions, *, kind: SceneKind) -> dict[Phase, fl
 
 
 def steps_share(*, matched: bool) -> float:
-    """Of the steps asked for, how many will be taken: mostly, matches move the cameras, which then stand still."""
+    """The share of the requested steps that will be taken: fewer if matches move cameras, which then stand still."""
     return FIRST_ROUND + LEARNING if matched else 1.0
 
 
@@ -160,7 +160,7 @@ def _search(dataset: Dataset, effort: SeedingEffort) -> tuple[float, float, floa
 
 
 def matching_work(features: Sequence[float], pairs: float) -> dict[Phase, float]:
-    """What COLMAP has before it where so many pairs of images with so many features [n] are to be matched."""
+    """COLMAP's work where so many pairs of images with so many features [n] are to be matched."""
     mean = sum(features) / len(features)
     # Linear, as measured: of temple, fountain-P11 and fox (310, 55 and 330 pairs; 1,934, 6,688 and 3,257 features) a
     # million takes 12.4, 13.0 and 17.2 s.

@@ -42,7 +42,7 @@ def pose_question(dataset: Dataset) -> PoseQuestion | None:
 
 
 def borne_out(dataset: Dataset, pairs: Sequence[MatchedPair]) -> PoseQuestion | None:
-    """The same, of details that are known: by the right poses they lie in front of both cameras, on one ray of each."""
+    """The same for known details: at the right poses they lie in front of both cameras, on one ray of each."""
     if len(pairs) < LEAST_PAIRS:
         return None
     form = format_of(dataset.source)
@@ -97,12 +97,12 @@ def _asked(reading: Sequence[PoseReading], shares: tuple[float, float]) -> str:
 
 
 def as_warning(question: PoseQuestion) -> str:
-    """The question with the option that says yes, for those who cannot be asked."""
+    """The question as a warning, with the option that answers yes, for users who cannot be asked."""
     return f"{question.question} If so, set given_poses={','.join(question.given_poses)}"
 
 
 def best_turn(world_from_body: Mapping[int, Array], pairs: Sequence[MatchedPair]) -> Array:
-    """body_from_cam [3, 3], by which most of what pairs of photos have in common fits.
+    """The body_from_cam [3, 3] that fits most of the details that pairs of photos share.
 
     Args:
         world_from_body: poses [4, 4] by the rows that pairs name.

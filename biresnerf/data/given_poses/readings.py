@@ -26,16 +26,16 @@ _ROLLS: tuple[PoseReading, ...] = ("rolled_90", "rolled_180", "rolled_270")
 
 
 def format_of(source: SourceFormat) -> Format:
-    """How the input's format has poses. Blender's dialect is no format of its own."""
+    """How the input's format writes poses. Blender's dialect is no format of its own."""
     return formats().get(source.dialect, formats()["transforms"])
 
 
 def poses_read_as(
     world_from_cam: NDArray[np.float64], source: SourceFormat, reading: Sequence[PoseReading]
 ) -> NDArray[np.float64]:
-    """Poses [n, 4, 4] that were read from ``source`` as its format says, as they are by ``reading``.
+    """Poses [n, 4, 4], read from ``source`` as its format says, converted to ``reading``.
 
-    The file's own matrices are made again and read anew: left out, what is right about them stays.
+    The file's own matrices are restored and read again; what ``reading`` does not name stays.
     """
     form = format_of(source)
     # Of a file with ``applied_transform`` the matrices lie in the world that this leads to.
@@ -71,7 +71,7 @@ def _reordered(rotation: NDArray[np.float64], order: str) -> NDArray[np.float64]
 
 
 def read_as(dataset: Dataset, reading: Sequence[PoseReading]) -> Dataset:
-    """The set with its given poses read so; points, rigs and ids of a COLMAP model, which fit the others, go."""
+    """The set with its given poses read so; points, rigs and ids of a COLMAP model, which fit the old ones, go."""
     rows = np.flatnonzero(dataset.posed)
     if not reading or not len(rows):
         return dataset

@@ -1,4 +1,4 @@
-"""COLMAP's answer for a set, asked once: a run that goes on is given the same poses again."""
+"""COLMAP's answer for a set, kept so that a resumed run gets the same poses again."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ def remembered_mapping(
 ) -> Mapping:
     """What COLMAP finds, or found when it was asked the same before and the file ``remember`` kept it.
 
-    An answer found with more effort than is asked for now is as good.
+    An answer found with more effort than is now requested is as good.
 
     Raises:
         InputError: ``seed_timeout``.
-        Interrupted: ``should_stop`` said so.
+        Interrupted: ``should_stop`` returned true.
         RefinementError: ``seeding_crashed``.
     """
     key = _fingerprint(dataset, seed) if remember is not None else ""

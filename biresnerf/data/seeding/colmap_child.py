@@ -49,7 +49,7 @@ def main(request_path: Path) -> None:
 
 
 def say(text: str) -> None:
-    """A line for the job's log."""
+    """Print a line for the job's log."""
     sys.stdout.write(f"{SAYS}{text}\n")
     sys.stdout.flush()
 
@@ -57,7 +57,7 @@ def say(text: str) -> None:
 def map_images(request: dict[str, Any]) -> dict[str, Any]:
     """Features and matches; the largest model of image by image mapping, guided by the poses there are.
 
-    And global mapping's, which places more and makes more mistakes: always where poses are missing, else where the
+    Also global mapping's, which places more and makes more mistakes: always where poses are missing, else where the
     first leaves out many images.
     """
     import pycolmap
@@ -300,7 +300,7 @@ def map_globally(
 
 
 def keep_intrinsics(database_path: Path, model: Any, request: dict[str, Any], numbers: list[int]) -> None:
-    """What image by image mapping found of a lens holds for what follows, so that models can be compared."""
+    """Keep the lenses found by image by image mapping for what follows, so that models can be compared."""
     import pycolmap
 
     database = pycolmap.Database.open(database_path)

@@ -70,7 +70,7 @@ def verification_options(request: dict[str, Any]) -> Any:
 def leave_out_still(request: dict[str, Any], database_path: Path) -> bool:
     """Verify again without matches that stay where they are, if many pairs show both such ones and others.
 
-    An object was turned before a still backdrop then, or all photos carry the same writing: two motions in a pair.
+    Then an object was turned before a still backdrop, or all photos carry the same writing: two motions in a pair.
     """
     import pycolmap
 
@@ -106,7 +106,7 @@ def likeliest_pairs(
 ) -> list[tuple[str, str]]:
     """Of the pairs (all, if not given) the `count` of each photo whose coarsest features match best.
 
-    Poses have no say, as the given ones may be wrong. After preemptive matching (Wu, Towards linear-time incremental
+    Poses are not used, as the given ones may be wrong. After preemptive matching (Wu, Towards linear-time incremental
     structure from motion, 3DV 2013).
     """
     import pycolmap

@@ -43,7 +43,7 @@ def run_colmap(
 
     Raises:
         InputError: ``seed_timeout``.
-        Interrupted: ``should_stop`` said so.
+        Interrupted: ``should_stop`` returned true.
         RefinementError: ``seeding_crashed``: COLMAP itself failed.
     """
     request_path, log_path = work / "request.json", work / LOG

@@ -67,7 +67,7 @@ _QUICKLY = 1  # PNG's compression of photos that are written for COLMAP, and rem
 
 @dataclass(frozen=True, eq=False)
 class MappedModel:
-    """What one way of mapping made of the images, in a frame and scale of its own.
+    """The model that one way of mapping made of the images, in its own frame and scale.
 
     Attributes:
         mapper: ``incremental`` or ``global``.
@@ -125,12 +125,12 @@ def ask_colmap(
 
     Beside the log in ``log_folder`` the tracks are left, for `Tracks.load`, also where mapping took too long. The file
     ``kept`` holds what is found of features and matches, for a run that goes on after it was killed. One thread maps
-    where all poses are given: more would make the answer differ from run to run. Where little is asked, one also looks
-    for features and matches: each takes memory.
+    where all poses are given: more would make the answer differ from run to run. With low effort, one also looks for
+    features and matches: each takes memory.
 
     Raises:
         InputError: ``seed_timeout``, or a code of `open_image`.
-        Interrupted: ``should_stop`` said so.
+        Interrupted: ``should_stop`` returned true.
         RefinementError: ``seeding_crashed``.
     """
     low = effort == "low"
@@ -260,7 +260,7 @@ def thoroughness(dataset: Dataset, effort: SeedingEffort, count: float) -> dict[
 
 
 def chosen_pairs(count: int, each: int) -> int:
-    """About how many pairs it makes if each of so many photos chooses others."""
+    """About how many pairs there are if each of so many photos chooses `each` others."""
     return round(CHOSEN_ONCE * count * each)
 
 
@@ -296,8 +296,8 @@ def nearest_pairs(apart: NDArray[np.float64], count: int) -> set[tuple[int, int]
 def read_mapping(dataset: Dataset, answer: dict[str, Any]) -> Mapping:
     """`ask_colmap`'s answer for this set, best model first: by images placed, then by features explained, and how well.
 
-    Of lego with noisy poses (200 px) both ways of mapping place all; global mapping explains more features, with half
-    the error again, and its poses are off by half as much again.
+    On lego with noisy poses (200 px) both ways of mapping place all; global mapping explains more features, with 1.5
+    times the error, and its poses are off by 1.5 times as much.
     """
     index = {name: i for i, name in enumerate(_numbered(dataset))}
     models = [_model(model, index) for model in answer["models"]]
@@ -351,7 +351,7 @@ def _same_lenses(one: MappedModel, other: MappedModel) -> bool:
 
 
 def model_lens_problem(dataset: Dataset, model: MappedModel) -> str | None:
-    """An impossible lens is what COLMAP finds where the views fix too little."""
+    """Why a lens of a model is impossible, as COLMAP finds where the views fix too little; else None."""
     known = known_intrinsics(dataset)
     for i, camera in model.cameras.items():
         problem = None if known[i] else lens_problem(camera.full(), camera.width, camera.height)

@@ -1,4 +1,4 @@
-"""Models that feature matches support: what given poses lack by them, and carried into their frame, believed or not."""
+"""Models that feature matches support: carried into the frame of given poses, and whether to believe them."""
 
 from __future__ import annotations
 
@@ -117,8 +117,8 @@ def in_measured_frame(matched: MatchedPoses, dataset: Dataset) -> MatchedPoses:
 def without_offset(dataset: Dataset, models: Sequence[MappedModel]) -> Dataset:
     """The set with the cameras' poses in place of those of bodies that carry them, where a model shows these.
 
-    The best model tells: its frame is found with the offset, so that the given frame stays. It tells as well
-    whether the given matrices are inverted.
+    The best model decides: its frame is found with the offset, so that the given frame stays. It also shows whether the
+    given matrices are inverted.
     """
     given = [frame.world_from_cam for frame in dataset.frames]
     pairs = [

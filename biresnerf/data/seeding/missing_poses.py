@@ -25,7 +25,7 @@ def fill_measured(
 ) -> NDArray[np.bool_]:
     """Fills poses [n, 4, 4] that are not ``known`` [n] by GPS and a drone's gimbal, in place; says which [n].
 
-    Known cameras tell the frame of these, and how the camera is mounted: an offset that all share (`tie`). Where none
+    Known cameras give the frame of these, and how the camera is mounted: an offset that all share (`tie`). Where none
     is known, poses are in the frame of the positions, and the camera looks where the gimbal says. None is filled where
     known cameras contradict the measurements, or are fewer than `LEAST_TIED`.
     """

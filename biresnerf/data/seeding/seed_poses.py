@@ -78,7 +78,7 @@ class Seeding:
 
 @dataclass(frozen=True, eq=False)
 class _Given:
-    """The poses there are: identity where there is none."""
+    """The given poses; identity where there is none."""
 
     dataset: Dataset
     poses: NDArray[np.float64]
@@ -117,7 +117,7 @@ class _Given:
         return InitialPoses(poses, name, tuple(sources))
 
     def measured(self, poses: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Which poses [n, 4, 4] GPS and a gimbal tell beside those ``known`` [n]; they are filled in."""
+        """Fill in poses [n, 4, 4] by GPS and a gimbal, besides those ``known`` [n]; returns which."""
         if known.all():
             return np.zeros_like(known)
         return fill_measured(poses, known, position_priors(self.dataset))
@@ -141,7 +141,7 @@ def seed_poses(
 ) -> Seeding:
     """The set with a pose for every image, and the sets of poses worth starting from.
 
-    ``given`` takes the poses as they are. ``none`` looks for no features: missing poses are guessed from other
+    ``given`` takes the poses unchanged. ``none`` looks for no features: missing poses are guessed from other
     images. ``auto`` lets features complete the given poses and compete with them; where there are none, COLMAP maps
     the images from scratch, in a frame and scale of its own. ``colmap`` does that in any case and then ties the
     result to the frame of given poses. Images that COLMAP cannot place are where GPS and a drone's gimbal say, or
@@ -150,12 +150,12 @@ def seed_poses(
 
     COLMAP's threads make its answer differ a little from run to run. A run that is to be continued keeps it in the
     file ``remember``, with colmap.log beside it. ``on_progress`` is called only if
-    COLMAP does run: at once, then when more is known. What all given poses lack on the camera's side is taken back
-    first, unless they are to stay as they are (``takes_back_offset``).
+    COLMAP does run: at once, then when more is known. An offset that all given poses share on the camera's side is
+    removed first, unless they must not change (``takes_back_offset``).
 
     Raises:
         InputError: ``pose_missing``, ``colmap_missing``, ``seed_failed``, ``insufficient_overlap`` or ``seed_timeout``.
-        Interrupted: ``should_stop`` said so.
+        Interrupted: ``should_stop`` returned true.
         RefinementError: ``seeding_crashed``: COLMAP itself failed, and there are no given poses. Where there are,
             the set that is returned has the fault.
     """

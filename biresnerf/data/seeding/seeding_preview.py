@@ -50,7 +50,7 @@ def write_seeding_preview(
 
     Args:
         dataset: as it was given.
-        found: what COLMAP has found out.
+        found: what COLMAP has found so far.
         poses: those given, or to start from.
     """
     sheet, progress = folder / PHOTOS, folder / SEEDING_JSON

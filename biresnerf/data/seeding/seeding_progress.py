@@ -22,7 +22,7 @@ class SeedingProgress:
 
     Attributes:
         features: how many each has, of those that were looked at.
-        matches: how many features each pair has in common once that was verified; pairs with any alone.
+        matches: how many features each verified pair has in common; only pairs with any.
         tried: how many pairs were verified, of `pairs` in all.
         matched: whether matching is over.
         kept: a new copy of all this, for a run that goes on later.
@@ -68,7 +68,7 @@ def read_progress(database: Path, pairs: int) -> SeedingProgress | None:
 
 
 class SeedingWatch:
-    """Tells of news in the database, when asked to look, and never more often than every few seconds.
+    """Reports news in the database when `look` is called, at most every few seconds.
 
     Args:
         kept: where copies of the database go.
@@ -80,7 +80,7 @@ class SeedingWatch:
         self._copied_at = self._time_of_copy()
 
     def look(self) -> None:
-        """Tell if it is time and there is news."""
+        """Report if it is time and there is news."""
         if time.monotonic() < self._next:
             return
         found = read_progress(self._database, self._pairs)

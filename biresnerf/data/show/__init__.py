@@ -1,1 +1,1 @@
-"""What is made of a result to be looked at: renders, thumbnails, view.json, the training curve. Decides nothing."""
+"""Pictures and files for looking at a result: renders, thumbnails, view.json, the training curve. Decides nothing."""

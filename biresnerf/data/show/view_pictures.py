@@ -32,7 +32,7 @@ def write_thumbnail(photo: NDArray[np.uint8], path: Path) -> Path:
 
 
 def write_contact_sheet(images: ImageSet, folder: Path) -> ContactSheet | None:
-    """All photos in one picture, and where each lies; None, and no file, of more than 4,000."""
+    """All photos in one picture, and where each lies; None, and no file, for more than 4,000."""
     sides = [side for count, side in CELL_PX if len(images) <= count]
     if not sides:
         return None
@@ -57,7 +57,7 @@ def write_points(
 ) -> tuple[ShownPoints, ...]:
     """Writes a file for each layer: its source, positions [n, 3] in the input's world and colours [n, 3].
 
-    Of more than 20,000 points evenly many are left out; a layer without points has no file.
+    More than 20,000 points are thinned evenly; a layer without points has no file.
     """
     written = []
     for source, positions, colours in layers:

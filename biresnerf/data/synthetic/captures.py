@@ -133,7 +133,7 @@ def write_walk(folder: Path, n_views: int, width: int, seed: int, maker: Maker |
 def write_panoramas(folder: Path, n_views: int, width: int, seed: int) -> Path:
     """Writes panoramas (JPEG, named so by their XMP) of a walk around the table, and nerfstudio's transforms.json.
 
-    The camera is held upright to a few degrees and turned anyhow; poses are the true ones.
+    The camera is held upright to a few degrees and turned arbitrarily; poses are the true ones.
 
     Returns:
         the path of transforms.json.
