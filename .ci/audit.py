@@ -1,7 +1,7 @@
-"""Known faults of the pinned libraries, as far as an index tells of them.
+"""Checks the pinned libraries for known vulnerabilities, as far as an index lists them.
 
-`python .ci/audit.py TOOLS`: exit status 1 where a library has a known fault. What could not be looked up (no network,
-an index without advisories) is skipped, by its name.
+`python .ci/audit.py TOOLS`: exit status 1 if a library has a known fault. Libraries that could not be looked up (no
+network, an index without advisories) are skipped and named.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ ANSWER_S = 180
 
 
 def asked(tools: Path) -> dict[str, Any] | None:
-    """What pip-audit found; none where it found nothing out."""
+    """The findings of pip-audit; None if it could not look anything up."""
     command = [tools / "bin/pip-audit", "--requirement", "constraints.txt", "--no-deps", "--disable-pip"]
     try:
         done = subprocess.run(
@@ -32,7 +32,7 @@ def asked(tools: Path) -> dict[str, Any] | None:
 
 
 def judged(found: dict[str, Any]) -> int:
-    """The exit status, after saying what it is for."""
+    """The exit status for the findings, which are printed."""
     libraries = found["dependencies"]
     skipped = [library["name"] for library in libraries if "skip_reason" in library]
     if skipped:
@@ -48,7 +48,7 @@ def judged(found: dict[str, Any]) -> int:
 
 
 def main() -> int:
-    """Look up and judge."""
+    """Run the audit; returns the exit status."""
     found = asked(Path(sys.argv[1]))
     return 0 if found is None else judged(found)
 

@@ -1,8 +1,8 @@
 """`make release`: builds the wheel and the source distribution in build/release, checks and describes them.
 
-From the last commit alone: the source distribution is made of a clean copy, the wheel of the source distribution,
-without Node. Then the wheel is installed alone into a fresh environment of each Python named, where it refines a made
-scene: `python .ci/release.py PYTHON...`.
+Uses only the last commit: the source distribution is built from a clean copy, the wheel from the source distribution,
+without Node. The wheel is then installed alone into a fresh environment of each given Python, where it refines a
+synthetic scene: `python .ci/release.py PYTHON...`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ QUICK_START = (
 
 
 def main(pythons: list[str]) -> None:
-    """Raises: SystemExit: with a sentence on what is wrong."""
+    """Make and check a release; raises `SystemExit` that says what is wrong."""
     OUT.mkdir(parents=True, exist_ok=True)
     for old in OUT.iterdir():
         old.unlink()
@@ -54,7 +54,7 @@ def main(pythons: list[str]) -> None:
 
 
 def check_contents(wheel: Path, sdist: Path) -> str:
-    """The version, if both hold what they should, and nothing else."""
+    """Check that both hold what they should, and nothing else; returns the version."""
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
         metadata = next(name for name in names if name.endswith(".dist-info/METADATA"))
@@ -73,10 +73,10 @@ def check_contents(wheel: Path, sdist: Path) -> str:
 
 
 def try_alone(python: str, wheel: Path) -> None:
-    """Install the wheel and the pinned libraries into a fresh environment, and refine a small made scene there."""
+    """Install the wheel and the pinned libraries into a fresh environment, and refine a small synthetic scene there."""
     with tempfile.TemporaryDirectory() as folder:
         run(python, "-m", "venv", f"{folder}/alone")
-        # No program but Python and what the system has: no Node, no git, no compiler.
+        # Only this Python on the path: no Node, no git, no compiler.
         environment = {"PATH": f"{folder}/alone/bin", "HOME": folder, "LANG": "C.UTF-8"}
         environment |= {
             name: value for name, value in os.environ.items() if name.startswith(("PIP_", "SSL_"))
@@ -90,7 +90,7 @@ def try_alone(python: str, wheel: Path) -> None:
 
 
 def describe(version: str, files: tuple[Path, ...]) -> None:
-    """Print sizes and digests, and leave the digests beside the files."""
+    """Print sizes and digests, and write the digests beside the files."""
     lines = [f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.name}\n" for path in files]
     (OUT / "SHA256SUMS").write_text("".join(lines))
     print(f"{version} in {OUT.relative_to(ROOT)}:")
@@ -100,7 +100,7 @@ def describe(version: str, files: tuple[Path, ...]) -> None:
 
 
 def run(*command: str, cwd: Path | str | None = None, env: dict[str, str] | None = None) -> str:
-    """What a program prints. Raises: SystemExit: it failed."""
+    """Run a program; returns its output, raises `SystemExit` if it fails."""
     path = (env or os.environ).get("PATH", "")
     program = next(
         (f"{part}/{command[0]}" for part in path.split(":") if os.access(f"{part}/{command[0]}", os.X_OK)),

@@ -1,4 +1,4 @@
-"""Puts the compiled kernels of the image where Numba may add to them, then becomes the command.
+"""Copies the image's compiled kernels to where Numba can add to them, then executes the command.
 
 On another kind of CPU than the image's, Numba compiles its own kernels beside them.
 """
@@ -20,7 +20,7 @@ def place_kernels(image: Path, folder: Path) -> None:
     made_from = folder / "made-from"
     if made_from.exists() and filecmp.cmp(image / "made-from", made_from, shallow=False):
         return
-    # Whole at once: another container may use or start on the same volume.
+    # Replaced atomically: another container may use the same volume or start on it.
     fresh = folder.with_name(f"{folder.name}.{os.uname().nodename}.{os.getpid()}")
     old = fresh.with_name(f"{fresh.name}.old")
     shutil.copytree(image, fresh)
@@ -28,7 +28,7 @@ def place_kernels(image: Path, folder: Path) -> None:
         if folder.exists():
             folder.rename(old)
         fresh.rename(folder)
-    except OSError:  # the other was faster
+    except OSError:  # another container was faster
         shutil.rmtree(fresh, ignore_errors=True)
     shutil.rmtree(old, ignore_errors=True)
 

@@ -1,8 +1,8 @@
-"""Whether this container is well: `python -I health.py`, the image's HEALTHCHECK. Exit status 0: it is.
+"""Checks this container's health: `python -I health.py`, the image's HEALTHCHECK. Exit status 0: healthy.
 
-What is asked follows from the command that the container runs: the web process answers that it is ready; the
-event loops of worker and dispatcher go on, and a worker holds the lock of its slot, which `health.py live` does not
-ask; of any other command the runtime sees for itself whether it runs.
+The check depends on the container's command. The web process must answer that it is ready; the event loops of worker
+and dispatcher must be running, and a worker must hold its slot's lock, unless called as `health.py live`. For other
+commands, the container runtime sees whether they run.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import urllib.request
 from pathlib import Path
 
 ANSWER_S = 8.0
-# A process itself ends when its loop does nothing for so long.
+# A process whose loop hangs for so long ends itself.
 SILENCE_S = 60.0
 
 
@@ -26,7 +26,7 @@ def command_line() -> list[str]:
 
 
 def trouble_of_api(port: str) -> str:
-    """Why the web process is not ready; empty where it is."""
+    """Why the web process is not ready; empty if it is."""
     try:
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/readyz", timeout=ANSWER_S):
             return ""
@@ -37,7 +37,7 @@ def trouble_of_api(port: str) -> str:
 
 
 def trouble_of_worker(slots: Path) -> str:
-    """Why no slot of this container runs; empty where each does."""
+    """Why a slot of this container does not run; empty if all do."""
     locks = list(slots.glob(f"{os.uname().nodename}.*"))
     for lock in locks:
         with lock.open("rb") as file:
@@ -50,7 +50,7 @@ def trouble_of_worker(slots: Path) -> str:
 
 
 def trouble_of_loop(beats: Path, silence_s: float = SILENCE_S) -> str:
-    """Why the event loop of this container does not go on; empty where it does."""
+    """Why this container's event loop counts as hung; empty if it runs."""
     shown = [beat.stat().st_mtime for beat in beats.glob(f"{os.uname().nodename}.*")]
     if not shown:
         return f"no process has started yet ({beats} is empty)"
@@ -59,7 +59,7 @@ def trouble_of_loop(beats: Path, silence_s: float = SILENCE_S) -> str:
 
 
 def main() -> int:
-    """Exit status of the check; says on standard output what is wrong."""
+    """Run the check; returns the exit status and prints what is wrong."""
     words = command_line()
     trouble = ""
     if "api" in words or "up" in words:

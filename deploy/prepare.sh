@@ -1,5 +1,5 @@
 #!/bin/sh
-# Makes what compose.yaml needs and lacks: secrets/ with random keys, and .env. Changes nothing that is there.
+# Creates what compose.yaml needs: secrets/ with random keys, and .env. Changes no existing file.
 #   sh deploy/prepare.sh          jobs run on the CPU
 #   sh deploy/prepare.sh gpu      jobs run on one NVIDIA GPU
 set -eu

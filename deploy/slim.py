@@ -1,8 +1,8 @@
-"""Takes out of an environment what no process of the service uses, and prints what that frees.
+"""Removes from an environment what no process of the service uses, and prints the bytes freed.
 
-`python slim.py /opt/venv`, while the image is built: tests and C headers of libraries, programs of torch's own tests, a
-second PostgreSQL, and with binutils' `strip` the symbols of the largest libraries. Type stubs stay: some libraries read
-theirs when they run. docs/deployment.md says what is left.
+`python slim.py /opt/venv`, while the image is built. Removes tests and C headers of libraries, programs of torch's
+tests, a second PostgreSQL, and, with binutils' `strip`, the symbols of the largest libraries. Type stubs stay: some
+libraries read theirs when they run. docs/deployment.md says what is left.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-# Triton compiles against headers of its own and of CUDA.
+# Triton compiles against its own and CUDA's headers.
 KEPT = {"triton", "nvidia"}
-NEEDED = {"torch_shm_manager"}  # of torch's programs: shares tensors between processes
+NEEDED = {"torch_shm_manager"}  # torch's program that shares tensors between processes
 STRIPPED = ("torch/lib/*.so*", "llvmlite/binding/*.so")
 
 
 def unused(packages: Path) -> Iterator[tuple[str, Path]]:
-    """Each file and folder that can go, and what it is."""
+    """Each removable file and folder, with its kind."""
     for folder in sorted(packages.rglob("*")):
         if folder.is_dir() and not KEPT & set(folder.relative_to(packages).parts):
             if folder.name in {"test", "tests"}:
@@ -42,7 +42,7 @@ def size(path: Path) -> int:
 
 
 def slim(packages: Path) -> dict[str, int]:
-    """Remove and strip; returns the bytes freed, by what they were."""
+    """Remove and strip; returns the bytes freed by kind."""
     freed: dict[str, int] = {}
     for what, path in unused(packages):
         if path.exists():  # not within a folder that is gone already
@@ -59,7 +59,7 @@ def slim(packages: Path) -> dict[str, int]:
 
 
 def main() -> None:
-    """Slim the environment that is named."""
+    """Slim the given environment."""
     (packages,) = Path(sys.argv[1]).glob("lib/python3*/site-packages")
     freed = slim(packages)
     for what, found in sorted(freed.items(), key=lambda item: -item[1]):

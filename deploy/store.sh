@@ -1,5 +1,5 @@
 #!/bin/sh
-# The bucket is a folder; the keys come from files; then becomes the S3 store.
+# Makes the bucket's folder, reads the keys from files, then executes the S3 store.
 set -eu
 mkdir -p /data/biresnerf
 ROOT_ACCESS_KEY_ID=$(cat /run/secrets/storage_access_key_id)

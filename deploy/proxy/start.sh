@@ -1,5 +1,5 @@
 #!/bin/sh
-# Writes what depends on this installation, then becomes nginx.
+# Writes this installation's configuration, then executes nginx.
 set -eu
 nameserver=$(awk '/^nameserver/ { print $2; exit }' /etc/resolv.conf)
 case "$nameserver" in *:*) nameserver="[$nameserver]" ;; esac

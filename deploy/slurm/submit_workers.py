@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Submits to Slurm as many one-job workers as jobs wait for; docs/slurm.md.
+"""Submits one-job workers to Slurm for the jobs that wait; see docs/slurm.md.
 
     submit_workers.py --most 20 [--kind gpu] [--every 30] [-- OPTIONS OF SBATCH]
 
-Runs where `squeue` and `sbatch` do, with psycopg, as the user whom the workers are to belong to. BIRESNERF_QUEUE_URL
-has the database's address, or BIRESNERF_QUEUE_URL_FILE names a file with it; a role that may read the view queue_depth
-is enough. Without --every it looks once, for cron and scrontab. Exit status 0: what was needed is submitted.
+Needs `squeue`, `sbatch` and psycopg; runs as the user who is to own the workers. BIRESNERF_QUEUE_URL holds the
+database's address, or BIRESNERF_QUEUE_URL_FILE names a file with it; a role that may read the view queue_depth
+suffices. Without --every it runs once, for cron and scrontab. Exit status 0: what was needed is submitted.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from pathlib import Path
 import psycopg
 
 WORKER = Path(__file__).with_name("worker.sh")
-# Two that look at once, from cron or from two hosts, would each submit all.
+# Without a lock, two concurrent runs would each submit all workers.
 LOCK = 7_201_608
 ANSWER_S = 60.0
 ARRAY_MOST = 1000  # Slurm's default for MaxArraySize is 1001
@@ -32,26 +32,26 @@ IS_OVER = {"COMPLETING", "STAGE_OUT"}
 
 @dataclass(frozen=True)
 class Workers:
-    """Workers of one kind that Slurm has: that wait for an allocation, and that run."""
+    """Slurm's workers of one kind: those that wait for an allocation, and those that run."""
 
     pending: int
     running: int
 
 
 def workers_in(states: Counter[str]) -> Workers:
-    """From how many workers are in each of Slurm's states; one that is about to end has no further job."""
+    """The workers by the counts of Slurm's states; ending workers do not count, as they take no more jobs."""
     running = sum(number for state, number in states.items() if state in RUNS)
     over = sum(number for state, number in states.items() if state in IS_OVER)
     return Workers(states.total() - running - over, running)
 
 
 def wanted(waiting: int, busy: int, workers: Workers, most: int) -> int:
-    """How many to submit.
+    """How many workers to submit.
 
     Args:
-        waiting: jobs that a further worker would be given.
-        busy: jobs that run on workers of the kind. Workers beyond these have started and take one each soon.
-        most: workers that there may be at a time, waiting for their allocation or running.
+        waiting: jobs that another worker would get.
+        busy: jobs that run on workers of this kind. Other running workers have just started and will take one each.
+        most: maximum number of workers, waiting for an allocation or running.
     """
     idle = max(0, workers.running - busy)
     lacking = waiting - workers.pending - idle
@@ -59,7 +59,7 @@ def wanted(waiting: int, busy: int, workers: Workers, most: int) -> int:
 
 
 def database_url() -> str:
-    """From the environment, or the file it names; raises `SystemExit`."""
+    """The address from the environment, or the file it names; raises `SystemExit`."""
     if file := os.environ.get("BIRESNERF_QUEUE_URL_FILE"):
         return Path(file).read_text().strip()
     if url := os.environ.get("BIRESNERF_QUEUE_URL"):
@@ -68,14 +68,14 @@ def database_url() -> str:
 
 
 def seen_by_slurm(name: str) -> Workers:
-    """Our workers of this name; raises `subprocess.SubprocessError` where Slurm does not answer."""
+    """Our workers of this name; raises `subprocess.SubprocessError` if Slurm does not answer."""
     command = ["squeue", "--me", "--noheader", "--array", f"--name={name}", "--format=%T"]
     answer = subprocess.run(command, capture_output=True, text=True, check=True, timeout=ANSWER_S)
     return workers_in(Counter(answer.stdout.split()))
 
 
 def submit(number: int, name: str, kind: str, more: list[str]) -> None:
-    """As one array; raises `subprocess.SubprocessError`. The workers get our environment, but not our database role."""
+    """Submit one array; raises `subprocess.SubprocessError`. Workers get our environment without our database role."""
     environment = {
         key: value for key, value in os.environ.items() if not key.startswith("BIRESNERF_QUEUE_URL")
     }
@@ -84,10 +84,10 @@ def submit(number: int, name: str, kind: str, more: list[str]) -> None:
 
 
 def look(url: str, name: str, kind: str, most: int, more: list[str]) -> str:
-    """One round; says what was found and done."""
+    """Run one round; returns what was found and done."""
     with psycopg.connect(url, autocommit=True, connect_timeout=int(ANSWER_S)) as connection:
         connection.execute("SELECT pg_advisory_lock(%s)", (LOCK,))
-        # Slurm first: a job that is taken between the two looks is then counted as under way, not twice as waiting.
+        # Ask Slurm first: a job taken between the two queries then counts as running, not twice as waiting.
         workers = seen_by_slurm(name)
         row = connection.execute(
             "SELECT waiting, running FROM queue_depth WHERE slot_kind = %s", (kind,)
@@ -104,13 +104,13 @@ def look(url: str, name: str, kind: str, most: int, more: list[str]) -> str:
 
 
 def trouble(error: Exception) -> str:
-    """What went wrong, in a line or a few."""
+    """The error in one or a few lines."""
     said = error.stderr if isinstance(error, subprocess.CalledProcessError) else ""
     return f"{error} {said}".strip()
 
 
 def main() -> int:
-    """Exit status of the last round."""
+    """Run rounds; returns the exit status of the last one."""
     parser = argparse.ArgumentParser(description="Submit as many one-job workers to Slurm as jobs wait for.")
     parser.add_argument("--most", type=int, required=True, help="Workers at a time, waiting and running.")
     parser.add_argument("--kind", choices=("cpu", "gpu"), default="cpu")
@@ -126,7 +126,7 @@ def main() -> int:
             sys.stdout.write(look(url, name, asked.kind, asked.most, asked.sbatch) + "\n")
             status = 0
         except (psycopg.Error, subprocess.SubprocessError, OSError) as error:
-            # Nothing is submitted unless both have answered: the jobs wait, and the next look finds them.
+            # Nothing is submitted unless both have answered: jobs wait until the next round.
             sys.stderr.write(f"nothing can be submitted now: {trouble(error)}\n")
             status = 1
         sys.stdout.flush()

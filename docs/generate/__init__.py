@@ -1,1 +1,1 @@
-"""Pages that are made of the code, so that they cannot be wrong about it: `python -m docs.generate` or `make docs`."""
+"""Generates pages from the code, so that they always agree with it: `python -m docs.generate` or `make docs`."""

@@ -1,4 +1,4 @@
-"""`python -m docs.generate`: writes every page and notebook that is made of the code."""
+"""`python -m docs.generate`: writes every page and notebook that is generated from the code."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from docs.generate.pages import GENERATED
 
 
 def main() -> None:
-    """Writes what differs, and says what that was."""
+    """Writes the files that differ, and prints their names."""
     for path, write in GENERATED.items():
         text = write()
         if not path.is_file() or path.read_text("utf-8") != text:

@@ -18,8 +18,8 @@ ROOT = Path(__file__).resolve().parents[2]
 
 Row = tuple[str, str]
 
-SHARED_BY = 5  # commands; an option of so many is described once
-ALIKE = 6  # options that a command describes as an earlier one does; so many are described there alone
+SHARED_BY = 5  # commands; an option that so many share is described once
+ALIKE = 6  # options that a command shares with an earlier one; so many are described only there
 
 _HEAD = """# Commands: all options
 
@@ -33,7 +33,7 @@ _SHARED = """
 
 
 def all_commands() -> dict[str, click.Command]:
-    """Every command of `biresnerf` by name, those of groups as ``keys create``."""
+    """Every command of `biresnerf` by name; those of groups as in ``keys create``."""
     targets = {name: target for section in SECTIONS for name, target in section.commands.items()}
     found: dict[str, click.Command] = {}
     for name in sorted(targets):
@@ -65,7 +65,7 @@ def shared_options(options: Iterable[list[Row]]) -> list[Row]:
 
 
 def like_earlier(name: str, rows: dict[str, list[Row]], shared: Container[Row]) -> tuple[str, list[Row]]:
-    """The first earlier command that describes `ALIKE` or more of this one's own options in the same words, and these."""
+    """The first earlier command that shares `ALIKE` or more of this one's own options word for word, and these."""
     own = [row for row in rows[name] if row not in shared]
     for earlier in itertools.takewhile(lambda other: other != name, rows):
         alike = [row for row in own if row in rows[earlier]]

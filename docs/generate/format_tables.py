@@ -1,4 +1,4 @@
-"""The list and table of formats in docs/formats.md and the web page's lists of them, from the formats' declarations."""
+"""The formats' list and table in docs/formats.md, and the web page's lists, from the formats' declarations."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from docs.generate.markdown import DASH, table
 _TESTS = Path(__file__).resolve().parents[2] / "tests"
 _NAMES = {"bpy": "Blender", "gaussian-splatting": "3D Gaussian Splatting", "open3d": "Open3D"}
 _END = "<!-- end -->"
-_USUAL = "poses and lenses"  # what formats give where the page says nothing
+_USUAL = "poses and lenses"  # what a format gives unless the page says otherwise
 _MADE_FROM = (
     "its ",
     "their ",
     "the programs' ",
-)  # the source, manual or writer of the format: the page says so of all
+)  # the source, manual or writer of the format: the page mentions these once for all
 _RARE: dict[Loss, str] = {  # the sentence below the table names the formats that hold them
     "rigs": "rigs",
     "mask paths": "paths of masks",
@@ -42,7 +42,7 @@ _NEEDS: dict[Need, str] = {
 
 
 def format_page(path: Path) -> str:
-    """docs/formats.md with its generated parts as they should be now."""
+    """docs/formats.md with its generated parts up to date."""
     text = path.read_text("utf-8")
     tables = {
         "formats read": _read_list(),
@@ -70,7 +70,7 @@ def _reading(one: Format) -> str:
 
 
 def _readers() -> dict[str, list[str]]:
-    """By format the programs that read it in tests, as their marks say: ``opens(format, by=program)``."""
+    """The programs that read each format in tests, from their marks: ``opens(format, by=program)``."""
     folder = _TESTS / "consumers"
     versions = dict(
         re.findall(r"^([\w-]+)==(\S+)", (folder / "requirements.txt").read_text("utf-8"), re.MULTILINE)
@@ -118,7 +118,7 @@ def _write_table() -> str:
 
 
 def _holds(one: Format, loss: Loss) -> bool:
-    """Whether it holds what most formats lose, and is more than a picture of the set."""
+    """Whether the format keeps this as well as masks and lenses, unlike mere pictures of the set."""
     return loss not in one.loses and not {"masks", "lenses"} & set(one.loses)
 
 

@@ -1,4 +1,4 @@
-"""Tables and values as Markdown has them."""
+"""Tables and values in Markdown."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _cell(text: str) -> str:
 
 
 def code(value: Any) -> str:
-    """A value as one writes it on the command line: JSON's words, text without quotes."""
+    """A value as on the command line: in JSON, but text without quotes."""
     if isinstance(value, bool):
         return f"`{str(value).lower()}`"
     if isinstance(value, float):

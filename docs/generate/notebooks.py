@@ -1,4 +1,4 @@
-"""The scripts of examples/ as notebooks: their cells, split at ``# %%``; outputs stay as long as the code does."""
+"""The scripts of examples/ as notebooks, with cells split at ``# %%``; outputs stay while the code is unchanged."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ _CELL = re.compile(r"^# %%(?P<markdown> \[markdown\])?\n", re.MULTILINE)
 
 
 def notebook(script: Path) -> str:
-    """The script as a notebook of format 4.5; what stands before its first cell (its docstring) is left out.
+    """The script as a notebook of format 4.5; the text before its first cell (the docstring) is left out.
 
-    If the notebook that is there has the same code, its outputs are kept.
+    If the existing notebook has the same code, its outputs are kept.
     """
     text = script.read_text("utf-8")
     marks = list(_CELL.finditer(text))
@@ -37,7 +37,7 @@ def notebook(script: Path) -> str:
 
 
 def _keep_outputs(cells: list[dict[str, object]], before: list[dict[str, object]]) -> None:
-    """Take over what the cells printed and drew; nothing where the code of any has changed."""
+    """Copy the cells' old outputs, unless the code of any cell has changed."""
 
     def code(some: list[dict[str, object]]) -> list[object]:
         return [cell["source"] for cell in some if cell["cell_type"] == "code"]

@@ -40,7 +40,7 @@ line a value is JSON where possible, else text: `--set holdout=0`, `--set start=
 
 
 def option_titles() -> str:
-    """What the page and report.html call the options: biresnerf/viewer/option_titles.json."""
+    """The options' titles on the page and in report.html: biresnerf/viewer/option_titles.json."""
     titles = {name: option.title for name, option in OPTIONS.items()}
     return json.dumps(titles, indent=1, ensure_ascii=False) + "\n"
 

@@ -1,4 +1,4 @@
-"""Everything that is generated, by the file it lies in."""
+"""All generated files, each with its writer."""
 
 from __future__ import annotations
 
@@ -45,5 +45,5 @@ def _writers() -> dict[Path, Callable[[], str]]:
     }
 
 
-# What writes the text of every page and notebook, as it should be now.
+# The writer of each page's and notebook's current text.
 GENERATED = _writers()

@@ -22,7 +22,7 @@ FILES = {
 
 
 class _Written(GenerateJsonSchema):
-    """Files hold every field, even those with a default."""
+    """Requires every field, even with a default: files hold all of them."""
 
     def field_is_required(self, field: object, total: bool) -> bool:
         return True
@@ -32,7 +32,7 @@ def result_schema() -> str:
     """A definition for each file."""
     models = [(model, "serialization") for model in FILES.values()]
     _, schema = models_json_schema(models, schema_generator=_Written)
-    # Except lines of the history, which leave out what was not measured.
+    # Except for lines of the history, which omit what was not measured.
     fields = HistoryLine.model_fields.items()
     schema["$defs"]["HistoryLine"]["required"] = [name for name, field in fields if field.is_required()]
     schema["$comment"] = ", ".join(f"{model.__name__}: {file}" for file, model in FILES.items())

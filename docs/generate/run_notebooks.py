@@ -1,6 +1,6 @@
-"""`python -m docs.generate.run_notebooks [NAME...]`: runs the notebooks of examples/ and keeps what they show.
+"""`python -m docs.generate.run_notebooks [NAME...]`: runs the notebooks of examples/ and keeps their outputs.
 
-Each runs in a kernel of its own and in a new folder, as a user would run it. The walks take some minutes each.
+Each runs in its own kernel and a new folder, as a user would run it. The walks take some minutes each.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def executed(text: str) -> str:
     for cell, done in zip(kept["cells"], ran["cells"], strict=True):
         if cell["cell_type"] == "code":
             cell["execution_count"] = done["execution_count"]
-            # The bar is over, and so are a kernel's own words on standard error.
+            # Progress bars and the kernel's messages on standard error are dropped.
             cell["outputs"] = [output for output in done["outputs"] if output.get("name") != "stderr"]
     return json.dumps(kept, indent=1, ensure_ascii=False) + "\n"
 

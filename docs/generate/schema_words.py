@@ -1,4 +1,4 @@
-"""What a field of a model takes, in words, from its JSON Schema."""
+"""The values that a model's field takes, in words, from its JSON Schema."""
 
 from __future__ import annotations
 

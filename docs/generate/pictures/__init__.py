@@ -1,1 +1,1 @@
-"""Pictures of docs/pictures: drawn from the code, from a made scene that is refined, or taken of the page."""
+"""The pictures of docs/pictures: drawn from code, made by refining a synthetic scene, or screenshots."""

@@ -15,7 +15,7 @@ HEIGHT, PER_LETTER, MARGIN = 20, 6.7, 7  # px
 
 
 def badges(root: Path) -> dict[Path, Callable[[], str]]:
-    """What writes each badge."""
+    """Each badge's file, with its writer."""
     project = tomllib.loads((root / "pyproject.toml").read_text("utf-8"))["project"]
     pythons = re.findall(r"Python :: (3\.\d+)", "\n".join(project["classifiers"]))
     python = f"{pythons[0]} to {pythons[-1]}"
@@ -26,7 +26,7 @@ def badges(root: Path) -> dict[Path, Callable[[], str]]:
 
 
 def badge(name: str, value: str) -> str:
-    """A picture of two words."""
+    """A badge with two words."""
     left, right = (round(len(text) * PER_LETTER) + 2 * MARGIN for text in (name, value))
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{left + right}" height="{HEIGHT}" role="img" '

@@ -18,7 +18,7 @@ CAMERAS: tuple[tuple[str, str, Array], ...] = (
     ("LLFF", "poses_bounds.npy", np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])),
 )
 COLOURS = ("#c62828", "#2e7d32", "#1565c0")
-WIDTH, HEIGHT, MIDDLE = 250, 240, (92, 140)  # px, of a panel, and where its camera stands
+WIDTH, HEIGHT, MIDDLE = 250, 240, (92, 140)  # px, of a panel, and its camera's position
 # Screen, px, of right, down and forward: a camera that looks to the right and away from the reader.
 SCREEN_FROM_CAM = np.array([[36.0, 0, 72], [26, 64, -22]])
 CORNERS = np.array(
@@ -29,7 +29,7 @@ PIXEL, COLUMNS, ROWS, GRID_AT = 36, 4, 3, (48, 76)  # px, counts, and the grid's
 
 
 def conventions_svg() -> str:
-    """The picture, with a white ground so that it is read on a dark page, too."""
+    """The picture, with a white background so that it is readable on dark pages, too."""
     panels = [_camera(*camera) for camera in CAMERAS] + [_pixels()]
     moved = (f'<g transform="translate({i * WIDTH} 0)">{panel}</g>' for i, panel in enumerate(panels))
     arrows = "".join(

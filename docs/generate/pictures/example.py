@@ -1,4 +1,4 @@
-"""service/example: the finished example of the page, a result of which only what the page shows is kept."""
+"""service/example: the page's finished example, a result reduced to what the page shows."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SHOWN, QUALITY = 4, 85  # views, and JPEG quality of their pictures
 
 
 def keep_example(result: Path, example: Path) -> None:
-    """The files of a result that the page shows, with small pictures, in place of those in ``example``."""
+    """Replace the files in ``example`` by those of a result that the page shows, with small pictures."""
     for old in example.glob("*"):
         if old.is_dir() and old.name != UNSEEN:
             shutil.rmtree(old)
@@ -50,7 +50,7 @@ def _keep_model(result: Path, archive: Path) -> None:
 
 
 def keep_unseen(pictures: Mapping[str, Image.Image], example: Path) -> None:
-    """Pictures of one unseen view, by what they show, for those who have no job yet."""
+    """Store named pictures of one unseen view, for users who have no job yet."""
     (example / UNSEEN).mkdir(parents=True, exist_ok=True)
     for name, picture in pictures.items():
         small = picture.resize((UNSEEN_SIDE, UNSEEN_SIDE), Image.Resampling.LANCZOS)

@@ -20,12 +20,12 @@ from biresnerf.result import Result
 from service.web_page import EXAMPLE
 
 CAMERAS = Path(__file__).resolve().parents[2] / "pictures/cameras.webp"
-MOVING, STILL, FRAME_MS = 24, 10, 60  # frames, and how long each is seen
-WIDTH, HEIGHT, FINE = 480, 420, 2  # px of the film, and how much finer it is drawn
+MOVING, STILL, FRAME_MS = 24, 10, 60  # frames, and the duration of each
+WIDTH, HEIGHT, FINE = 480, 420, 2  # px of the film, and its supersampling
 GIVEN, REFINED = (150, 150, 150), (31, 119, 180)
 SCENE = ("field", "tracks", "moved", "features")  # layers of points, the best first
-FRUSTUM = 0.066  # its depth, of the distance from which the scene is seen
-SIGHT, FROM = 1.55, np.array([0.55, -0.95, 0.62])  # px per px of width at distance 1; where the eye is
+FRUSTUM = 0.066  # its depth, relative to the eye's distance
+SIGHT, FROM = 1.55, np.array([0.55, -0.95, 0.62])  # focal length per width; the eye's direction
 
 
 def main() -> None:
@@ -34,7 +34,7 @@ def main() -> None:
 
 
 def draw_cameras(result: Result, path: Path) -> None:
-    """The cameras with their photos on the way from the given to the returned poses, around the scene's points."""
+    """Draw the cameras with their photos, moving from given to returned poses around the scene's points."""
     way = np.linspace(0, 1, MOVING)
     eased = np.concatenate([np.zeros(STILL), way**2 * (3 - 2 * way), np.ones(2 * STILL)])
     photos, stage = _photos(result), _stage(result)
@@ -45,7 +45,7 @@ def draw_cameras(result: Result, path: Path) -> None:
 
 
 def between(result: Result, share: float) -> Array:
-    """Poses [n, 4, 4] on the shortest way from the given to the returned ones."""
+    """Poses [n, 4, 4] on the shortest path from the given to the returned ones."""
     start, end = result.poses_before, result.poses
     turn = Rotation.from_matrix(end[:, :3, :3] @ start[:, :3, :3].swapaxes(1, 2)).as_rotvec()
     poses = start + share * (end - start)
@@ -55,7 +55,7 @@ def between(result: Result, share: float) -> Array:
 
 @dataclass(frozen=True)
 class _Stage:
-    """Where the scene is seen from, and its points, already drawn."""
+    """The viewpoint, and the scene's points as a picture."""
 
     eye: Array  # [3]
     eye_from_world: Array  # [3, 3]

@@ -1,4 +1,4 @@
-"""The README's before and after: `python -m docs.generate.pictures.refined_scene` refines a made still life.
+"""The README's before and after: `python -m docs.generate.pictures.refined_scene` refines a synthetic still life.
 
 Takes about ten minutes. Writes docs/pictures/before_after.webp, the same view for the start page, and the film
 docs/pictures/flight.webp.
@@ -51,7 +51,7 @@ def main() -> None:
 
 
 def draw_before_after(given: Result, refined: Result, turned: float, path: Path) -> None:
-    """One unseen view of fields that learned equally long from poses that stayed, given and refined, and its photo.
+    """Draw one unseen view of fields trained equally long at fixed given and refined poses, beside its photo.
 
     Below, the part in which the renders differ most, enlarged.
     """
@@ -84,7 +84,7 @@ def draw_before_after(given: Result, refined: Result, turned: float, path: Path)
 
 
 def draw_flight(given: Path, refined: Path, path: Path) -> None:
-    """Two films side by side, as one that any page plays."""
+    """Draw two films side by side, as an animated picture."""
     frames = []
     for pair in zip(imageio.get_reader(given), imageio.get_reader(refined), strict=True):
         frame = Image.new("RGB", (2 * FRAME_SIDE + GAP, CAPTION + FRAME_SIDE), "white")

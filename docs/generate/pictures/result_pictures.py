@@ -46,11 +46,11 @@ def main() -> None:
 
 
 def draw_errors(temporary: Path) -> None:
-    """Each image's errors before and after; the scene is that of the example."""
+    """Draw each image's errors before and after, with the example's scene as truth."""
     scene, refined = temporary / NAME, temporary / "refined.json"
     truth = make_scene(scene, KIND, views=VIEWS, size=SIZE, noise=NOISE, seed=SEED).truth
     result = biresnerf.load(EXAMPLE)
-    # The example keeps poses.json alone of the result's files with poses.
+    # Of the result's files with poses, the example keeps only poses.json.
     poses = dict(zip(result.names, result.poses @ OPENGL_FROM_OPENCV, strict=True))
     document = json.loads(truth.read_text("utf-8"))
     for frame in document["frames"]:

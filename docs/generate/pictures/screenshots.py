@@ -1,7 +1,7 @@
-"""`make screenshots`: pictures of the web page for the docs, of a real service that refines a made scene, in Chromium.
+"""`make screenshots`: pictures of the web page for the docs, in Chromium, from a real service with a synthetic scene.
 
 Takes some minutes. Writes the files of `SCREENSHOTS`, and keeps the job's result as the finished example of the page.
-Fails where a picture shows a prediction that its own run missed by more than `MOST_MISSED`.
+Fails if a picture shows a prediction that its own run missed by more than the factor `MOST_MISSED`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ ARGUMENTS = ("--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader")
 
 
 def main() -> None:
-    """Make a scene, and take it through the page from the upload to the comparison of two jobs."""
+    """Make a scene, and use the page from the upload to the comparison of two jobs."""
     with (
         tempfile.TemporaryDirectory() as temporary,
         temporary_service() as url,
@@ -69,7 +69,7 @@ def main() -> None:
 
 
 def chromium_of(playwright: Playwright) -> Browser:
-    """Debian's Chromium."""
+    """Launch Debian's Chromium."""
     chromium = shutil.which("chromium") or shutil.which("chromium-browser")
     if chromium is None:
         raise SystemExit("There is no Chromium; on Debian: apt install chromium")
@@ -85,7 +85,7 @@ def _show_check(page: Page) -> None:
 
 
 def _job_of(page: Page, url: str) -> tuple[str, str]:
-    """Starts the job; the ids of the job and of its set."""
+    """Starts the job; returns its id and its set's."""
     with page.expect_response(f"{url}/v1/jobs") as sent:
         page.get_by_role("button", name="Refine the poses").click()
     job = sent.value.json()
@@ -100,7 +100,7 @@ def _show_running(page: Page) -> None:
 
 
 def _check_predictions(client: Client, job_id: str, left: float | None, at: datetime) -> None:
-    """Hold the seconds that the check showed, and those ``left`` when the job ran, against what the job took."""
+    """Compare the seconds that the check predicted, and those ``left`` during the job, with the actual ones."""
     job = client.job(job_id)
     report = client.dataset(job.dataset_id).report
     if report is None or job.started_at is None or job.finished_at is None or left is None:
@@ -143,7 +143,7 @@ def _show_comparison(page: Page, address: str) -> None:
 
 
 def _wait_for_drawing(page: Page) -> None:
-    """Until what comes after the markup is there: the 3-D view, its photos and the curves."""
+    """Wait for what is drawn after the markup: the 3-D view, its photos and the curves."""
     page.wait_for_timeout(SETTLING_MS)
 
 
