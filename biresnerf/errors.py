@@ -66,7 +66,7 @@ class Interrupted(BiresnerfError):
 
 @contextmanager
 def needs_extra(extra: str) -> Iterator[None]:
-    """Around imports of what an extra of this package installs; raises `InputError` (``extra_missing``)."""
+    """Context for imports of what an extra of this package installs; raises `InputError` (``extra_missing``)."""
     try:
         yield
     except ModuleNotFoundError as error:

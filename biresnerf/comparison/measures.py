@@ -1,4 +1,4 @@
-"""The measures that tell which of two results has the better poses.
+"""The measures that decide which of two results has the better poses.
 
 Each measures the poses that a result returned, which may be the input's.
 """

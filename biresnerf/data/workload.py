@@ -35,7 +35,7 @@ TRIAL_STEPS = 200  # of those that choose the start
 # no colours yet (lego at 100 px, true poses: 16.2 dB after 50 steps, 19.2 after 200, 19.7 after 300, for 1.8 times the
 # work after the first look; fox 20.5 and 21.1, fountain-P11 23.6 and 23.8).
 PICTURE_STEPS, PICTURE_SHARE = 200, 1.5
-# Times the verdict's steps, to choose between photos and matches: shorter trials cannot tell wrong poses that agree
+# Times the verdict's steps, to choose between photos and matches: shorter trials cannot detect wrong poses that agree
 # with each other from bent ones (docs/estimator.md).
 PHOTO_TRIALS = 2
 # Thousands of observations of tracks that take as long as what an adjustment does without any: surfaces, patches, and

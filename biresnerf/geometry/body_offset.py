@@ -29,7 +29,7 @@ STRONG = 10.0  # twice the logarithm of a Bayes factor (Kass and Raftery 1995)
 # A shift along a direction is left out if it is so few deviations from zero, and known no better than to this share of
 # the spread of the cameras.
 TOLD, VAGUE = 3.0, 0.05
-SAME = 1e-3  # of the largest singular value: what is smaller cannot be told
+SAME = 1e-3  # of the largest singular value: what is smaller cannot be determined
 FURTHEST = 0.3  # rad, and spreads of the rig: the longest step
 SETTLED = 1e-6  # of a standard deviation
 MAXWELL_MEDIAN = 1.5382  # of the length of three normal deviates
@@ -156,7 +156,7 @@ class _Pair:
         return max(float(np.linalg.norm(centres - centres.mean(0), axis=1).mean()), 1e-300)
 
     def likelihood(self, cam_from_body: Array) -> float:
-        """Of the errors that an offset leaves, once the rigs are aligned."""
+        """Likelihood of the errors that an offset leaves, once the rigs are aligned."""
         bodies = self.fitted @ cam_from_body
         frame = align_robust(bodies, self.given, with_rotations=True)
         turned, shifted = _apart(self.given, frame.apply_to_poses(bodies))

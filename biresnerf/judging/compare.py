@@ -66,7 +66,7 @@ FACING_FORWARD, FACING_FORWARD_BOUNDED = Rule(least=1.0, errors=0), Rule(least=2
 # Photos that one of two results confirms and the other does not, +1 or -1; 0 for all others.
 PHOTOS_CONFIRMED = Rule()
 # Bounds that two results state of one pose, in octaves. On five sets they missed true errors by up to 2.5 times
-# (docs/estimator.md, Uncertainty), so that less than a factor of two tells nothing.
+# (docs/estimator.md, Uncertainty), so that less than a factor of two shows nothing.
 STATED_ACCURACY = Rule(least=1.0)
 ANY_GAIN = Rule(errors=0)  # of one camera's own matches, or over a guess
 # One camera's error in a frozen field, in octaves: below 0.7 of the old one, and below a quarter where it is still

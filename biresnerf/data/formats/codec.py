@@ -71,7 +71,7 @@ _PINHOLE_HINT = "Export `pinhole`, which holds undistorted photos with PINHOLE c
 
 
 def cannot_hold(where: str, what: str, hint: str = _PINHOLE_HINT) -> InputError:
-    """The error for a set that a format, called so or written to ``where``, cannot hold."""
+    """The error for a set that a format, of this name or written to ``where``, cannot hold."""
     return InputError("export_not_possible", what, where=where, hint=hint)
 
 

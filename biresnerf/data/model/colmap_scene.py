@@ -100,7 +100,7 @@ class ColmapPoints:
         return np.repeat(np.arange(len(self)), np.diff(self.track_starts))
 
     def only(self, points: NDArray[np.bool_], elements: NDArray[np.bool_]) -> ColmapPoints:
-        """Those of these points [m], with these elements [k] of their tracks alone."""
+        """These points [m] alone, with these elements [k] of their tracks alone."""
         lengths = np.bincount(self.owner[elements], minlength=len(self))[points]
         return ColmapPoints(
             self.ids[points],

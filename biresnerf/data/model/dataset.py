@@ -191,7 +191,7 @@ class Cut:
 
     @property
     def firsts(self) -> NDArray[np.int64]:
-        """Of each frame of ``whole``, int64 [m], the first of the frames that show it."""
+        """For each frame of ``whole``, int64 [m], the first of the frames that show it."""
         return np.unique(self.rows, return_index=True)[1]
 
     def poses_of_whole(self, world_from_cam: NDArray[np.float64]) -> NDArray[np.float64]:

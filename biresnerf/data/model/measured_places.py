@@ -1,4 +1,4 @@
-"""Where photos were taken, as something beside their poses says."""
+"""Where photos were taken, by data other than their poses."""
 
 from __future__ import annotations
 

@@ -146,7 +146,7 @@ def images_called(folder: Path, name: str) -> list[Path]:
             path = folder / spelling
             if path.is_file():
                 return [path]
-            found: dict[str, Path] = {}  # file systems may not tell letter cases apart
+            found: dict[str, Path] = {}  # file systems may not distinguish letter cases
             for suffix in image_suffixes():
                 if found and suffix not in PLAIN_SUFFIXES:
                     break

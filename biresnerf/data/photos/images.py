@@ -65,7 +65,7 @@ class ImageSet:
         return len(self.cameras)
 
     def of(self, images: NDArray[np.int64]) -> ImageSet:
-        """Those images [m] alone, copied."""
+        """The set of images [m] alone, copied."""
         starts, lengths = self.offsets[images], np.diff(self.offsets)[images]
         offsets = np.concatenate(([0], np.cumsum(lengths)))
         pixels = np.arange(offsets[-1]) + np.repeat(starts - offsets[:-1], lengths)

@@ -1,4 +1,4 @@
-"""Images that a file names: inside the folder where that is asked, and not too few."""
+"""Checks of the images that a file names: inside the required folder, and not too few."""
 
 from __future__ import annotations
 

@@ -112,7 +112,7 @@ def metres_from_world(
 ) -> Similarity | None:
     """The similarity from cameras at poses [n, 4, 4] to measured places: control points, else cameras' positions.
 
-    None where neither tell. Only cameras that are `placed` [n] count.
+    None where neither determines it. Only cameras that are `placed` [n] count.
     """
     counted = np.ones(len(dataset), np.bool_) if placed is None else placed
     if not np.isfinite(world_from_cam[counted]).all():

@@ -27,7 +27,7 @@ def remembered_mapping(
     remember: Path | None,
     on_progress: OnSeeding,
 ) -> Mapping:
-    """What COLMAP finds, or found when it was asked the same before and the file ``remember`` kept it.
+    """What COLMAP finds, or found earlier for the same request if the file ``remember`` kept it.
 
     An answer found with more effort than is now requested is as good.
 
@@ -62,7 +62,7 @@ def remembered_mapping(
 
 
 def _fingerprint(dataset: Dataset, seed: int) -> str:
-    """Of everything that COLMAP's answer depends on."""
+    """A digest of everything that COLMAP's answer depends on."""
     given = [None if f.world_from_cam is None else f.world_from_cam.tolist() for f in dataset.frames]
     cameras = [[c.model, c.params] for c in dataset.cameras]
     digest = hashlib.sha256(json.dumps([dataset.names, seed, given, cameras]).encode())

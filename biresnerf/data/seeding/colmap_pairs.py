@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from biresnerf.data.seeding.seeding_progress import PAIRS
 
-# Features of a photo that tell which pairs are likely, and COLMAP's ratio.
+# Features of a photo that show which pairs are likely, and COLMAP's ratio.
 COARSEST, NEAREST_TO_NEXT = 256, 0.8
 LEAST_MATCHES = 12  # of a pair; small photos have few, COLMAP asks for more
 PAIRS_AT_ONCE = 2000  # between two copies of the database

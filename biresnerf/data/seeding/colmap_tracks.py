@@ -41,7 +41,7 @@ def write_tracks(database_path: Path, work: Path) -> Tracks | None:
         return None
     tracks = tracks.thinned(most_observations(len(number)), len(number))
     arrays: dict[str, Any] = tracks.kept()
-    with whole_file(work / KEPT) as temporary:  # whoever stops this process takes what is there
+    with whole_file(work / KEPT) as temporary:  # if this process is stopped, its parent takes what is there
         np.savez(temporary, **arrays)
     return tracks
 

@@ -176,7 +176,7 @@ def _numbered(dataset: Dataset) -> list[str]:
 
 
 def _rigs(dataset: Dataset, names: list[str]) -> list[list[list[tuple[str, list[list[float]]]]]]:
-    """Of the panoramas of each size, each one's views: names, and rotations [3, 3] to them from the panorama."""
+    """For the panoramas of each size, each one's views: names, and rotations [3, 3] to them from the panorama."""
     if dataset.cut is None:
         return []
     cut = dataset.cut

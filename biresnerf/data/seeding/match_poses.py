@@ -97,7 +97,7 @@ def carry_model(
 
 
 def in_measured_frame(matched: MatchedPoses, dataset: Dataset) -> MatchedPoses:
-    """Poses in metres in the frame of control points or measured positions, where these tell it.
+    """Poses in metres in the frame of control points or measured positions, where these determine it.
 
     For degrees along east, north and up; by a similarity that is robust to wrong positions. Otherwise they stay.
 

@@ -17,7 +17,7 @@ from biresnerf.report import PoseSource
 
 WIDEST_GAP = 6  # images from one known pose to the next that are still taken for a path
 FARTHEST = 3  # images beyond the end of a path that still take its last pose
-LEAST_TIED = 3  # cameras that tell the frame of measured poses
+LEAST_TIED = 3  # cameras that give the frame of measured poses
 
 
 def fill_measured(

@@ -218,7 +218,7 @@ def _without_features(given: _Given) -> InitialPoses:
 
 
 def _by_gimbal(given: _Given) -> InitialPoses | None:
-    """Where GPS and a gimbal say that the cameras are, if they do of enough of them."""
+    """Poses by GPS and a gimbal, if these cover enough of the cameras."""
     if given.measured(given.poses.copy(), given.posed).sum() < _least_placed(given.dataset):
         return None
     return given.candidate("gimbal", None, "gimbal", np.zeros((len(given.poses),) * 2, dtype=np.int64))
@@ -309,7 +309,7 @@ def _tied(model: MappedModel, given: _Given) -> MatchedPoses:
 
 
 def _facing_forward(given: _Given, what: str) -> Seeding:
-    """Where a gimbal says, else all cameras at one place, if photos are alike enough to have been taken from there."""
+    """Poses by a gimbal; else all cameras at one place, if photos are alike enough to have been taken from there."""
     dataset = given.dataset
     if (measured := _by_gimbal(given)) is not None:
         notes = (*dataset.warnings, f"{what}: {BY_GIMBAL}", *turning_notes(dataset))

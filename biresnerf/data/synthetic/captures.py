@@ -80,7 +80,7 @@ def walking_cameras(n_views: int, seed: int) -> NDArray[np.float64]:
 
 
 def table_textures(seed: int) -> list[Texture]:
-    """Those of `TABLE_SCENE`."""
+    """The textures of `TABLE_SCENE`."""
     around = [
         Texture.random(np.random.default_rng([seed, 7, scales]), scales)
         for scales in (_TABLE_SCALES, _ROOM_SCALES)

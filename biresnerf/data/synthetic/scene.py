@@ -154,7 +154,7 @@ def _trace(
 def _rays_that_may_hit(
     shape: Shape, origin: NDArray[np.float32], directions: NDArray[np.float32]
 ) -> NDArray[np.intp]:
-    """Those in the cone about the shape's bounding sphere; all of them from within it."""
+    """Indices of rays in the cone about the shape's bounding sphere; of all rays from within it."""
     to_centre = np.asarray(shape.centre, np.float32) - origin
     distance = float(np.linalg.norm(to_centre))
     if distance <= shape.bounding_radius:

@@ -64,7 +64,7 @@ def write_still_life(folder: Path, n_views: int, size: int, seed: int, maker: Ma
 
 
 def still_life_surfaces() -> list[Surface]:
-    """Those of `STILL_LIFE`, in its order."""
+    """The surfaces of `STILL_LIFE`, in its order."""
     light = Light(STILL_LIFE)
     patterns: list[Pattern] = [
         _wood(*_WOOD, seed=1), _Cloth(), _bricks, _marble, _Book(), _glaze, _glaze, _glaze, _orange,

@@ -27,7 +27,7 @@ _STEPS, _SETTLED, _DIFFERENCE = 30, 1e-12, 1e-5
 
 
 class Curve(NamedTuple):
-    """Of the common form of `biresnerf.geometry.camera.distortion`: distances from the principal point by angle.
+    """A curve of the form in `biresnerf.geometry.camera.distortion`: distances from the principal point by angle.
 
     Attributes:
         focal: in units of those of the distances.

@@ -103,7 +103,7 @@ def adjust_poses(
     unknown = lenses.free & ~found.lenses.observable
     if not unknown.any():
         return found
-    # The parameters are given up one kind at a time: without the last, the evidence may tell of the others.
+    # The parameters are given up one kind at a time: without the last, the evidence may determine the others.
     last = next(kind for kind in reversed(KINDS) if unknown[:, kind].any())
     given_up = unknown & np.isin(np.arange(LENS), last)
     again = adjust_poses(world_from_cam, replace(evidence, lenses=lenses.held(given_up)), prior)

@@ -94,7 +94,7 @@ class PatchPhotos:
 
 @dataclass(frozen=True, eq=False)
 class Positions:
-    """Where cameras were measured to be, in a frame of its own.
+    """Measured places of cameras, in a separate frame.
 
     Attributes:
         image: int64 [m].

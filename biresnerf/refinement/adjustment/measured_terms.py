@@ -21,7 +21,7 @@ from biresnerf.refinement.adjustment.solver.term import Linearised
 from biresnerf.refinement.adjustment.track_term import RAYLEIGH_MEDIAN, ROBUST_SCALE, TrackTerm
 
 FINEST_M = 1e-3  # no position is as exact
-MARKED_PX = 0.5  # nobody marks a point in a photo more exactly
+MARKED_PX = 0.5  # points in photos are not marked more exactly
 SETTLING = 3  # measurements of a noise level for cameras that stay
 DIMENSIONS = {"positions": 3, "control": 2}  # of a residual
 
@@ -121,7 +121,7 @@ class ControlTerm(TrackTerm):
 
     @property
     def noise(self) -> float:
-        """Of the observations, px."""
+        """The noise of the observations, px."""
         return self.noise_px
 
     def squares(self, cameras: Cameras, noise: float | None = None) -> Array:

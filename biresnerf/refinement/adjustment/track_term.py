@@ -30,7 +30,7 @@ FINEST_PX = 1e-3  # no feature is as exact: a lower noise level only makes the n
 SETTLING = 30
 APART = np.radians(
     0.1
-)  # between two rays: with less, they tell nothing of their point, and fit it wherever it is
+)  # between two rays: with less, they do not locate their point, and fit it wherever it is
 
 
 class TrackTerm:

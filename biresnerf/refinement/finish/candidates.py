@@ -22,7 +22,7 @@ from biresnerf.report import CandidateName
 logger = logging.getLogger(__name__)
 
 
-# On a tie the earlier is kept: the input's poses, unless the evidence cannot tell.
+# On a tie the earlier is kept: the input's poses, unless the evidence cannot decide.
 ORDER: tuple[CandidateName, ...] = (
     "input", "refined", "adjusted", "adjusted-patches", "adjusted-tracks", "matched",
 )  # fmt: skip

@@ -82,7 +82,7 @@ def choose_poses(
     adjusted = [as_candidate(name, each, split.fitted, cameras) for name, each in results.items()]
     found = [Candidate("refined", refined), *without_adjustment(scene, refined, joint.bodies)]
     candidates = sorted([*found, *filter(None, adjusted)], key=lambda candidate: ORDER.index(candidate.name))
-    # Fixed cameras are the same in all candidates: theirs tell only whose points fit them.
+    # Fixed cameras are the same in all candidates: their misfits only show whose points fit them.
     misfits = _misfits(candidates, split, noise_px, ~prior.fixed & split.placed, announce)
     if not misfits:
         return None

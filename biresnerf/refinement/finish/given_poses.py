@@ -54,7 +54,7 @@ class GivenPoses:
         return rotation or SHARED_ERRORS * self.rotation, position or SHARED_ERRORS * self.position
 
     def as_stated(self, rotation: float, position: float) -> GivenPoses:
-        """With what the user states: rad, and the input's unit; 0 where nothing is stated."""
+        """These poses with the errors that the user states: rad, and the input's unit; 0 where nothing is stated."""
         exact = EXACT * rms_spread(self.world_from_cam[:, :3, 3])
         return replace(
             self,

@@ -100,7 +100,7 @@ def _pays(found: Adjustment, best: Adjustment, left_out: Evidence) -> bool:
 
 
 def _misfits(found: Adjustment, left_out: Evidence, noise_px: float) -> Array | None:
-    """Of each point, the robust squares of its observations in noise levels; None where there are too few points."""
+    """For each point, the robust squares of its observations in noise levels; None where there are too few points."""
     assert found.lenses is not None
     assert left_out.lenses is not None
     cameras = Cameras.of(found.world_from_cam, left_out.lenses.known(found.lenses.correction))

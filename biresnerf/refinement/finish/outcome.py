@@ -30,7 +30,7 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class Finish:
-    """What came of the adjustment.
+    """The result of the adjustment.
 
     Attributes:
         candidates: the poses that were compared, and how they did.

@@ -63,7 +63,7 @@ def photo_patches(
 
 
 def _larger(scene: Scene, options: ResolvedOptions) -> ImageSet:
-    """The photos as large as they are, or as all of them together may be."""
+    """The photos at full size, or as large as all of them together may be."""
     full = [scene.dataset.camera_of(i) for i in range(len(scene.dataset))]
     pixels = sum(camera.width * camera.height for camera in full)
     share = min(1.0, (MOST_PIXELS / pixels) ** 0.5)

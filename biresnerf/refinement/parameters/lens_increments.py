@@ -1,4 +1,4 @@
-"""Changes of a camera's intrinsics as a row of numbers of like size, and the camera that a row makes of another."""
+"""Changes of a camera's intrinsics as a row of numbers of like size, and the camera that a row makes from another."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def free_columns(camera: Camera, part: RefinedPart) -> Tensor:
 
 
 def units(camera: Camera) -> Tensor:
-    """By how much a unit of each distortion increment changes its coefficient [11]."""
+    """The change of each distortion coefficient [11] per unit of its increment."""
     full = camera.full()
     x, y = max(full.cx, camera.width - full.cx) / full.fx, max(full.cy, camera.height - full.cy) / full.fy
     corner = (x * x + y * y) ** 0.5

@@ -32,7 +32,7 @@ class RunState:
         origin: what the run was started with; goes there, too.
 
     Attributes:
-        monitor: whoever follows the run.
+        monitor: the callbacks of a caller that follows the run.
         record: what has happened in it.
         history: its curve.
         ends: of `time.monotonic`, when it is to end.

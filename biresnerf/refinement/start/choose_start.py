@@ -72,7 +72,7 @@ def choose_start(
     should_stop: Callable[[], bool],
     did: Callable[[float], None] = lambda _work: None,
 ) -> InitialPoses:
-    """The candidate whose poses let a field predict unseen views best, as they are or after some steps.
+    """The candidate whose poses let a field predict unseen views best, unmoved or after some steps.
 
     Where that is not decided with the poses fixed, they move with the field: those near the truth improve, those of a
     wrong model do not. On a tie after that, too, the first one is kept. Cameras that all candidates guess are ignored.

@@ -47,8 +47,8 @@ class RefinedPoses:
         """The poses of any moment, [n, 4, 4] in the unit frame. The optimisation leaves frame and scale free.
 
         The similarity that fits the optimised poses to the given ones best fixes them; it is robust to lost cameras
-        unless the method says otherwise. Fixed cameras and rigs leave less free. Where nobody gave poses, measured
-        places fix the frame that they gave to those that were found.
+        unless the method says otherwise. Fixed cameras and rigs leave less free. Where no poses were given, measured
+        places fix the frame, as they did for those found.
         """
         optimised = joint.frame.unit_from_world.inverse().apply_to_poses(unit_from_cam)
         given, tied = dataset.world_from_cam, dataset.anchors

@@ -31,7 +31,7 @@ def sharpness(images: ImageSet, world_from_cam: Array) -> Array:
 
 
 def _laplacian_variance(images: ImageSet, index: int) -> float:
-    """Of the brightness (0 to 1), over pixels whose neighbours count as well."""
+    """Variance of the Laplacian of the brightness (0 to 1), over pixels whose neighbours count as well."""
     grey = images.image(index).astype(np.float64).mean(2) / 255
     if min(grey.shape) < 3:
         return 0.0

@@ -170,7 +170,7 @@ def held_out_report(renderer: Renderer, untrained: list[int], scores: Sequence[V
 
 
 def turntable_warnings(start: InitialPoses) -> tuple[str, ...]:
-    """A warning where photos do not tell which way the table turned; empty where they do, or there was none."""
+    """A warning where photos do not show which way the table turned; empty where they do, or there was none."""
     if start.source != "turntable":
         return ()
     better, other = start.trials

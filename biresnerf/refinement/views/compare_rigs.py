@@ -37,7 +37,7 @@ class Rig:
     cameras: tuple[Camera, ...]
 
     def of(self, images: NDArray[np.int64]) -> Rig:
-        """Those images [m] alone."""
+        """The rig of images [m] alone."""
         return Rig(self.world_from_cam[images], tuple(self.cameras[i] for i in images))
 
     def lenses(self, images: ImageSet) -> tuple[Camera, ...]:

@@ -11,7 +11,7 @@ from biresnerf.refinement.numbers.choosing import ViewNumbers
 
 
 def evenly_spread(views: Sequence[int], count: int) -> list[int]:
-    """So many of the views (at most all), in their order and evenly spread."""
+    """``count`` of the views (at most all), in their order and evenly spread."""
     return [views[int((i + 0.5) * len(views) / count)] for i in range(count)]
 
 

@@ -64,7 +64,7 @@ def ssim(image: Tensor, reference: Tensor, counts: Tensor | None = None) -> floa
 
 
 def shift_px(error_db: float, photo: NDArray[np.float32], counts: NDArray[np.bool_] | None = None) -> float:
-    """By how many px a photo [h, w, 3] has to be shifted to differ from itself by such a PSNR: `SHIFTS[-1]` at most.
+    """The shift (px) at which a photo [h, w, 3] differs from itself by such a PSNR: `SHIFTS[-1]` at most.
 
     It puts an error of colours in terms of a motion in the image. The blur of a render counts as well, so that a motion
     is overrated rather than underrated.

@@ -71,7 +71,7 @@ def position_notes(dataset: Dataset) -> tuple[str, ...]:
     if table is not None:
         return notes
     frames = dataset.frames
-    # A device writes heights or does not: some photos tell whether all are to be opened.
+    # A device writes heights or does not: some photos show whether all are to be opened.
     some = {frames[i] for i in np.linspace(0, len(frames) - 1, FEW).astype(int).tolist()}
     if not any(lacks_height(frame.path, frame.name) for frame in some):
         return notes

@@ -16,7 +16,7 @@ from biresnerf.errors import InputError
 POSITION_FILES = ("positions.csv", "gps.csv", "geotags.csv", "reference.csv", "reference.txt", "geo.txt")
 WGS84 = 4979  # EPSG's number of latitude, longitude and ellipsoidal height
 EPSG = r'AUTHORITY\["EPSG",\s*"(\d+)"\]'  # in the text form of a frame, the last one is its own
-# Geographic frames whose numbers people write most: WGS 84, ETRS89, NAD83. Others are told by what they hold.
+# Geographic frames whose numbers people write most: WGS 84, ETRS89, NAD83. Others are detected by what they hold.
 _DEGREES = frozenset({4326, WGS84, 4258, 4269})
 _PROJECTED = (range(2000, 4000), range(20000, 33000))
 _METRES = {"m": 1.0, "km": 1000.0, "ft": 0.3048, "us-ft": 1200 / 3937}

@@ -45,7 +45,7 @@ def time_in(stem: str) -> float | None:
 
 
 def in_seconds(time: float) -> float:
-    """A time since 1970 in seconds, whether given in these, ms, us or ns; other numbers as they are."""
+    """A time since 1970 in seconds, whether given in s, ms, us or ns; other numbers unchanged."""
     for least, unit in ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3)):
         if least <= time < 1e4 * least:
             return time * unit

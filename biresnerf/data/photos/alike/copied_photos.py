@@ -39,7 +39,7 @@ MOST_MOVED, MOST_APART, BLOCK = 0.06, 2.0, 4
 ASPECT = 0.01  # of width by height, which halving an odd number changes
 # Poses given for one picture: by how much they may be apart, the second as a share of the set's size.
 SAME_VIEW_DEG, SAME_VIEW = 0.5, 0.01
-_COARSE = 8  # cells of a side, whose means tell most pictures apart
+_COARSE = 8  # cells of a side, whose means distinguish most pictures
 _DECODERS = 4
 
 
@@ -112,7 +112,7 @@ class _Picture:
 
 
 def _compressed_again(dataset: Dataset, frames: Sequence[Frame], keep: Sequence[str]) -> dict[str, str]:
-    """Of ``frames``, the photos that show another's picture in other bytes, by name, with that one."""
+    """Those of ``frames`` that show another's picture in other bytes, by name, with that one."""
     with quiet_pillow(), ThreadPoolExecutor(_DECODERS, thread_name_prefix="copies") as pool:
         pictures = [picture for picture in pool.map(_picture, frames) if picture is not None]
     pictures.sort(
@@ -156,7 +156,7 @@ def _picture(frame: Frame) -> _Picture | None:
             box = (0, 0, width, height) if drafted is None else drafted[1]
             grey = image.convert("L").resize((LEAST_PX, LEAST_PX), Image.Resampling.BILINEAR, box=box)
     except UNREADABLE:
-        return None  # whoever needs the picture says what is wrong with it
+        return None  # the code that needs the picture reports what is wrong with it
     cells = turned(_means(np.asarray(grey, np.float32), FINE), shown)
     down, right = np.gradient(cells)
     step = float(np.sqrt((down**2 + right**2).mean()))

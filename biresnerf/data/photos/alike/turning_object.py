@@ -51,7 +51,7 @@ def still_surroundings(grey: NDArray[np.float32]) -> bool:
 
 
 def turning_notes(dataset: Dataset) -> tuple[str, ...]:
-    """What to tell the user where photos without any pose seem to show something that turns.
+    """Notes for the user where photos without any pose seem to show something that turns.
 
     Raises `InputError` as `image_likeness.thumbnails` does.
     """

@@ -98,7 +98,7 @@ def _window(side: int) -> NDArray[np.float32]:
 def _shift(
     before: NDArray[np.complex64] | None, now: NDArray[np.complex64], telling: NDArray[np.bool_]
 ) -> float:
-    """Median length of the blocks' shifts, px, by phase correlation (Kuglin and Hines 1975); 0 where none tells."""
+    """Median length of the blocks' shifts, px, by phase correlation (Kuglin and Hines 1975); 0 where none is clear."""
     if before is None or not telling.any():
         return 0.0
     product = now[telling] * np.conj(before[telling])

@@ -19,7 +19,7 @@ from biresnerf.geometry.camera.distortion import Coefficients, distort, distort_
 LENS = 8  # unknowns of a lens
 FOCAL, K1, K2, CENTRE, TANGENTIAL, ASPECT = 0, 1, 2, slice(3, 5), slice(5, 7), 7
 DISTORTION = [1, 2, 5, 6]  # k1, k2, p1, p2
-# In the order in which they are given up where the evidence does not tell of them, the last first, and freed.
+# In the order in which they are freed; given up, last first, where the evidence does not determine them.
 KINDS = ((0,), (3, 4), (1,), (2,), (5, 6), (7,))
 NEWTON = 8
 FURTHEST = 2.0  # times the slope itself that Newton's method may go
@@ -46,7 +46,7 @@ class Lenses:
         return self.deviation > 0
 
     def held(self, which: NDArray[np.bool_]) -> Lenses:
-        """With some parameters [g, 8] held where they are."""
+        """The lenses with some parameters [g, 8] held."""
         return replace(self, deviation=np.where(which, 0.0, self.deviation))
 
     def known(self, correction: Array) -> Lenses:

@@ -15,7 +15,7 @@ from biresnerf.refinement.adjustment.solver.elimination import inverse_blocks, l
 
 RANK = 1e-13  # of the largest eigenvalue: what is smaller is rounding, or one of the motions of the whole rig
 ROUNDING = 1e-12  # of a lens's own information: what poses leave of it, if that is not more, is rounding
-TOLD = 1e-9  # of a lens's own information, in systems that are not dense: what is told is more
+TOLD = 1e-9  # of a lens's own information, in systems that are not dense: lenses with less are unknown
 
 
 def posterior(cameras: Cameras, information: Blocks, lenses: Lenses) -> Array:
