@@ -128,11 +128,11 @@ class Settings(BaseSettings):
         0, ge=0, description="Seconds that one tenant's jobs may run in a day (UTC), added up; 0: no limit."
     )
 
-    max_files: int = Field(1000, ge=1, description="Files in a dataset.")
+    max_files: int = Field(10_000, ge=1, description="Files in a dataset.")
     max_file_bytes: int = Field(2 * GIB, ge=1, description="Size of one file of a dataset.")
-    max_dataset_bytes: int = Field(8 * GIB, ge=1, description="Size of all files of a dataset.")
-    max_archive_bytes: int = Field(8 * GIB, ge=1, description="Size of an uploaded archive.")
-    max_unpacked_bytes: int = Field(20 * GIB, ge=1, description="Size of all that comes out of an archive.")
+    max_dataset_bytes: int = Field(32 * GIB, ge=1, description="Size of all files of a dataset.")
+    max_archive_bytes: int = Field(32 * GIB, ge=1, description="Size of an uploaded archive.")
+    max_unpacked_bytes: int = Field(40 * GIB, ge=1, description="Size of all that comes out of an archive.")
 
     keep_results_days: float = Field(
         7.0, ge=0, description="Days to keep files of a finished job; 0: no limit."
