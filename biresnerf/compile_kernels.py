@@ -105,7 +105,7 @@ def _stamp(field: bool) -> Path:
     return Path(config.CACHE_DIR or cache_folder() / "kernels", f"compiled-{key}")  # type: ignore[attr-defined]
 
 
-@cache  # a process that has done it has them
+@cache  # once in a process
 def compile_field_kernels(*, backward: bool = True) -> None:
     """Run every kernel once on a tiny field, as a step does; without ``backward`` only those that render."""
     shape = FieldShape(grid_levels(2, 4, 8, 10), grid_levels(2, 16, 32, 10), unbounded=False)

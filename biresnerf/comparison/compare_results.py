@@ -95,7 +95,7 @@ def _far(found: PoseDifferences) -> str:
     which = f"{len(far)} of {len(found.rows)} photos"
     if len(far) <= NAMED and 2 * len(far) <= len(found.rows):
         which += f" ({', '.join(row.name for row in far)})"
-    if found.stated_deg is not None and turn <= FAR_BOUNDS * found.stated_deg:  # by where they lie alone
+    if found.stated_deg is not None and turn <= FAR_BOUNDS * found.stated_deg:  # by position alone
         return f"the positions of {which} differ by more than {FAR_BOUNDS:g} times what both state"
     stated = (
         f"far more than the ± {found.stated_deg:.2g}° that they state together"
@@ -158,7 +158,7 @@ def _others(first: Result, second: Result) -> list[ComparedFigure]:
         rows.append(("Final render, held-out views", *renders))
     rows.append(("Time", *(f"{sum(side.report.seconds.values()):.0f} s" for side in (first, second))))
     one, other = (side.report.options for side in (first, second))
-    # What keeps its proportion to the steps differs by them alone.
+    # Options in proportion to the steps differ only because of these.
     forth, back = one.with_steps(other.steps), other.with_steps(one.steps)
     for name in OPTIONS:
         a, b = getattr(one, name), getattr(other, name)

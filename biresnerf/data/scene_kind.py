@@ -14,7 +14,7 @@ class SceneKind:
     # Ray marching interval at the start, unit lengths: half a cell of the pose module.
     coarse_interval: float = 2.5e-2
     interval_pixels: float = 0.4  # of a pixel: the interval is no finer
-    samples: int = 1  # times the samples of a step that the options ask for
+    samples: int = 1  # times the samples of a step that the options request
     pose_start: float = 0.0  # of the least length of stage 1, over which the poses' rate rises at the least
     # Of the least length of stage 1: when lost cameras are looked for. The field has formed by half of it.
     repairs: tuple[float, ...] = (0.5, 1.0)

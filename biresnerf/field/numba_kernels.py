@@ -11,8 +11,8 @@ from numba.core import config
 
 __all__ = ["njit", "prange"]
 
-# LLVM avoids 512-bit registers by default; the field's kernels are long enough streams to gain from them. Whoever sets
-# NUMBA_CPU_NAME, as the tests do for an older processor, gets that one.
+# LLVM avoids 512-bit registers by default; the field's kernels are long enough streams to gain from them.
+# NUMBA_CPU_NAME, which the tests set for an older processor, takes precedence.
 if config.CPU_NAME is None:  # type: ignore[attr-defined]
     config.CPU_NAME = llvmlite.binding.get_host_cpu_name()  # type: ignore[attr-defined]
     config.CPU_FEATURES = llvmlite.binding.get_host_cpu_features().flatten() + ",-prefer-256-bit"  # type: ignore[attr-defined]

@@ -18,7 +18,7 @@ logger = logging.getLogger(__name__)
 
 RATES_FILE = "rates.json"
 _REMEMBERED = TypeAdapter(dict[str, dict[str, list[PositiveFloat]]])
-# Runs that are remembered; the middle one counts, so that two strange ones say nothing.
+# Runs that are remembered; the middle one counts, so that two outliers do not matter.
 KEPT = 5
 # A rate that is further from the general one is not believed. No general rates of GPUs are known.
 CREDIBLE = 3.0

@@ -64,7 +64,7 @@ class LiveView:
         self._names: tuple[str, ...] = ()
         self._cameras: dict[str, Any] = {}
         self._first_look = (np.full(3, 3.0), np.zeros(3))
-        # A browser that connects, in a thread of its own, while cameras are drawn must not keep the look before.
+        # A browser that connects, in another thread, while cameras are drawn must not keep the old view.
         self._looking = threading.Lock()
         self.server = _listening(host, port)
         self.url = f"http://{host}:{self.server.get_port()}"
@@ -81,7 +81,7 @@ class LiveView:
             if poses is None or now == self._drawn:
                 return False
             seen = read_state(self._folder, poses)
-        except (InputError, OSError) as error:  # the run is just replacing its files: the next look will do
+        except (InputError, OSError) as error:  # the run is just replacing its files: the next update will do
             logger.debug("not drawn: %s", error)
             return False
         self._draw(seen)

@@ -9,7 +9,7 @@ ComputeDevice = Literal["cpu", "cuda"]
 PresetName = Literal["fast", "balanced", "quality", "paper"]
 MethodName = Literal["biresnerf", "biresnerf-paper", "baa-ngp", "nerfacc-barf", "barf"]
 
-# A GPU affords larger batches and images at the same number of steps; `paper` is made for one and stays as it is.
+# A GPU affords larger batches and images at the same number of steps; `paper` is made for one and stays unchanged.
 CUDA_SCALE = {"samples_per_step": 4, "max_image_size": 2}
 
 # Each option's value in the presets, in the order of `PresetName`. The last column, `paper`, is Guo et al., Appl. Sci.

@@ -157,7 +157,7 @@ def _run_in_same_time(
         if calibration.outcome is None:
             return CellResult(cell=cell, error=f"calibration failed: {calibration.error}")
         ms_per_step = 1000 * calibration.outcome.optimisation_s / steps
-        # The probe tells how many steps a measurement can have that takes a tenth of the time.
+        # The probe shows how many steps fit into a measurement that takes a tenth of the time.
         longer = round(CALIBRATION_SHARE * 1000 * seconds / ms_per_step)
         if steps > PROBE_STEPS or longer < 2 * PROBE_STEPS:
             break

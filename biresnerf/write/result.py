@@ -79,7 +79,7 @@ def write_result(
     if verdict is not None and verdict.returned == "input":
         returned, returned_dataset = scene.dataset.world_from_cam, scene.dataset
         if np.isfinite(refined).all():
-            # What is said of the returned poses is not said of these.
+            # Statements about the returned poses do not hold for these.
             images = tuple(image.model_copy(update={"uncertainty": None}) for image in report.images)
             of_refined = report.model_copy(update={"images": images})
             _, moved = _write_poses(path / REFINED, scene, refined_dataset, refined, of_refined, field)

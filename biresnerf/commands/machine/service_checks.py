@@ -26,7 +26,7 @@ from biresnerf.wire.service import Health, Info
 
 ANSWER_S = 10.0
 CLOCK_OFF_S = 30.0
-CERTIFICATE_DAYS = 14.0  # what renews them by itself has done so long before
+CERTIFICATE_DAYS = 14.0  # automatic renewal happens long before
 WRITES = "datasets:write"
 PICTURES = 3
 

@@ -48,7 +48,7 @@ def inspect_command(
     from biresnerf.data.photos.video.video_frames import VideoReading
 
     dataset = read_dataset(input_path, videos=VideoReading(asked.video_frames))
-    # Loads torch: what is wrong with the input has been said by now.
+    # Loads torch; faults of the input have been reported by now.
     from biresnerf.field.backends import resolve_here
 
     options, _ = resolve_here(asked)

@@ -12,7 +12,7 @@ from typing import TypeAlias
 
 from biresnerf.data.photos.photo_folders import IMAGE_FOLDER
 
-# What a file that names no folders and extensions says nothing new with.
+# Ways of matching that deserve no note for a file that names neither folders nor extensions.
 EXPECTED = ("without extension", "by file name alone")
 _IMAGES = f"{IMAGE_FOLDER}/"
 

@@ -12,7 +12,7 @@ from biresnerf.data.model.dataset import Dataset, Frame
 from biresnerf.data.model.result_model import with_points
 from biresnerf.errors import InputError
 
-LEAST = 3  # photos that something can be made of
+LEAST = 3  # photos of a usable set
 
 
 def without_photos(dataset: Dataset, names: Sequence[str]) -> Dataset:

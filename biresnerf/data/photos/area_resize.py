@@ -19,7 +19,7 @@ def _shrink_rows(
 ) -> NDArray[np.float32]:
     """[h, ...] -> float32 [rows, ...]; fractional rows count by the fraction covered."""
     height = picture.shape[0]
-    if height == 2 * rows and picture.size <= _AT_ONCE:  # as pyramids ask for; the same without a loop
+    if height == 2 * rows and picture.size <= _AT_ONCE:  # as in pyramids; the same without a loop
         return (values(picture[::2]) + values(picture[1::2])) / np.float32(2)
     result = np.empty((rows, *picture.shape[1:]), dtype=np.float32)
     edges = np.arange(rows + 1) * (height / rows)
@@ -45,7 +45,7 @@ def area_resize(
     much memory.
 
     Sizes must not exceed the picture's. Resampling filters that weigh whole pixels (Pillow's BOX) shift
-    content by up to half a source pixel where the ratio is no integer; camera poses would feel that.
+    content by up to half a source pixel where the ratio is no integer, which would bias camera poses.
     """
     if not (0 < height <= picture.shape[0] and 0 < width <= picture.shape[1]):
         raise ValueError(f"cannot average {picture.shape[1]} x {picture.shape[0]} px to {width} x {height}")

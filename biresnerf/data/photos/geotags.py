@@ -80,7 +80,7 @@ def _place(exif: Image.Exif) -> MeasuredPlace | None:
     latitude = _degrees(tags[_LATITUDE]) * (-1 if tags.get(_LATITUDE_REF) == "S" else 1)
     longitude = _degrees(tags[_LONGITUDE]) * (-1 if tags.get(_LONGITUDE_REF) == "W" else 1)
     altitude = float(tags[_ALTITUDE]) * (-1 if tags.get(_ALTITUDE_REF) in _BELOW_SEA else 1)
-    # Zero for both is what devices write that have no fix yet. Comparisons with what is no number are false.
+    # Devices without a fix write zero for both. Comparisons with NaN are false.
     sensible = (
         abs(latitude) <= 90 and abs(longitude) <= 180 and abs(altitude) <= 1e5 and (latitude or longitude)
     )

@@ -18,7 +18,7 @@ from biresnerf.geometry.camera.lens import lens_problem
 GUESSED_FOCAL = 1.2  # of the long side, as COLMAP guesses: a field of view of 45 degrees, a normal lens
 FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
 PLAUSIBLE = (0.25, 20.0)  # of the long side, the focal length: angles of view of 127 to 3 degrees
-# EXIF's two ways of telling the focal length; the sensor's is the finer one, and more often wrong.
+# EXIF's two ways of stating the focal length; the sensor's is the finer one, and more often wrong.
 AGREE = 0.1
 CONTRADICTS = 1.5  # by this factor EXIF's focal length and a given one differ, and not for a crop or a zoom
 MOST_APART = 0.4  # logarithms of focal lengths that were guessed of one lens

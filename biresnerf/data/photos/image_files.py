@@ -225,7 +225,7 @@ def open_image(path: Path, name: str) -> Image.Image:
 def _refuse_segments(path: Path, name: str) -> None:
     """Raises InputError ``not_an_image`` for a JPEG whose head is in more pieces than any camera or program writes.
 
-    Pillow takes time by their number, and by its square where they are EXIF. This walks as it does.
+    Pillow takes time by their number, and by its square where they are EXIF. This scans the file as Pillow does.
     """
     pieces = exif = 0
     try:
@@ -274,7 +274,7 @@ def _all_but_raw() -> tuple[str, ...]:
 
 
 def is_plain(path: Path, name: str) -> bool:
-    """Whether an image is of a format and of numbers that other programs read, too. Raises as `open_image`."""
+    """Whether an image has a format and a pixel type that other programs read, too. Raises as `open_image`."""
     with quiet_pillow(), open_image(path, name) as image:
         return image.format in (*PLAIN_FORMATS, "MPO") and image.mode != "F"
 

@@ -23,7 +23,7 @@ from biresnerf.geometry.similarity import align_robust
 logger = logging.getLogger(__name__)
 
 # A camera that leaves its given pose by far more than the others do was placed by wrong matches (global mapping turned
-# one of lego's by 92 deg where the others moved by 12): this many medians, but not below these floors. Rotations tell
+# one of lego's by 92 deg where the others moved by 12): this many medians, but not below these floors. Rotations show
 # most. Noisy positions of few cameras scatter: at noise 0.15 true poses of 10 to 20 cameras are up to 6 medians away.
 STRAY_TURNS, STRAY_DEG = 4.0, 30.0
 STRAY_SHIFTS, STRAY_SHARE = 8.0, 0.2  # the floor is a share of the cameras' distance

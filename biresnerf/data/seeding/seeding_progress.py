@@ -11,7 +11,7 @@ from pathlib import Path
 
 LOOK_EVERY_S = 2.0
 # Beside the database: the pairs to match, where not all are, and a sign that they are matched. The database does not
-# tell: pairs that contradict the others are taken out of it again.
+# show it: pairs that contradict the others are taken out of it again.
 PAIRS, MATCHED = "pairs.txt", "matched"
 _MOST_IMAGES = 2_147_483_647  # of a pair's number in COLMAP's database, a pair being number * most + number
 

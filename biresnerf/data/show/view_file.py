@@ -12,7 +12,7 @@ from biresnerf.data.model.untrusted_file import checked, read_json_object
 from biresnerf.frozen_model import FrozenModel
 
 VIEW, THUMBNAIL = "view.json", "thumbnail.jpg"
-PREVIEW = "preview"  # folder of what a run under way shows of itself
+PREVIEW = "preview"  # folder with the previews of a run in progress
 CONTACT_SHEET, POINTS = "view/contact_sheet.jpg", "view/points_{source}.bin"
 
 

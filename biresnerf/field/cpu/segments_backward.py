@@ -22,7 +22,7 @@ from biresnerf.field.numba_kernels import njit, prange
 
 f4 = np.float32
 ONE = f4(1)
-# Smaller gradients of a sample are no gradients: Adam would not feel them, and processors take many times as long for
+# Smaller gradients of a sample count as zero: they do not affect Adam, and processors take many times as long for
 # products that are too small for a float's full precision, as those of empty space and of black become.
 FAINT = f4(1e-20)
 

@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 ORDER: tuple[CandidateName, ...] = (
     "input", "refined", "adjusted", "adjusted-patches", "adjusted-tracks", "matched",
 )  # fmt: skip
-# Candidates that patches were to be trusted for, and that patches left out prefer: photos have spoken for them.
+# Candidates that patches were to be trusted for, and that patches left out prefer: photos have confirmed them.
 BY_PATCHES: tuple[CandidateName, ...] = ("adjusted", "adjusted-patches")
 BY_TRACKS: tuple[CandidateName, ...] = ("adjusted", "adjusted-tracks")
 

@@ -52,7 +52,7 @@ def run_rounds(stages: TwoStages, scene: Scene) -> Finish:
     last = adjust_cameras(scene, optimiser.renderer, optimiser.recipe, run, repair, moves=again)
     if again and last.moved:
         optimiser.hold_poses()
-    # The poses that are held are what the first adjustment made of the field's.
+    # The poses that are held are the field's after the first adjustment.
     chosen_then = not again or (held and last.kept)
     return replace(last, candidates=then.candidates) if chosen_then else last
 

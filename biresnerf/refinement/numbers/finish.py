@@ -15,7 +15,7 @@ class EvidenceNumbers:
     # The same in what is returned. On scarf 21,000 of 133,000 leave 0.090 deg, all of them 0.048.
     most_in_the_end: int = 200_000
     up_to_cameras: int = 1000  # of these; more cameras get more of both, in proportion
-    lens_observations: int = 20_000  # that choose a lens's parameters; more tell the same
+    lens_observations: int = 20_000  # that choose a lens's parameters; more add nothing
     left_out_one_in: int = 5  # patches
     most_patches: int = 3000  # in all
     patches_of_photo: tuple[int, int] = (20, 200)  # the least and the most of one photo
@@ -41,8 +41,8 @@ class EvidenceNumbers:
     # they have, so that only what no evidence fixes is left to them.
     prior: float = 0.02
     # Standard deviation of a focal length, as a share of it, by who found it. Guesses: over 13 sets of photos of all
-    # kinds, the logarithm of the focal length over the guess (1.2 of the long side) has 0.4. What COLMAP found says
-    # nothing before: it is of the same matches; what a network predicts counts as a guess, what a maker measured as
+    # kinds, the logarithm of the focal length over the guess (1.2 of the long side) has 0.4. What COLMAP found is no
+    # prior: it is of the same matches; what a network predicts counts as a guess, what a maker measured as
     # given. EXIF: whole millimetres of 35 mm film, and what stabilisation cuts off.
     focal_given: float = 0.02
     focal_exif: float = 0.05  # see above
@@ -54,7 +54,7 @@ class EvidenceNumbers:
     centre_deviation: float = 0.01
     aspect_deviation: float = 0.005  # see above
     # A parameter is known from the evidence if its standard deviation there is less than this share of the one before:
-    # the evidence then has eight ninths of the say.
+    # the evidence then has eight ninths of the weight.
     observable: float = 1 / 3
     # A given focal length is contradicted if another one is preferred by more than so many standard deviations of what
     # is known before and of what the evidence says together.

@@ -10,7 +10,7 @@ from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser, StepRe
 
 logger = logging.getLogger(__name__)
 
-# Of the samples that the options ask for: if even these do not fit, batches are not the cause.
+# Of the requested samples: if even these do not fit, batches are not the cause.
 LEAST_SHARE = 1 / 16
 
 

@@ -158,7 +158,7 @@ BIRESNERF = Method(
 )
 
 # The baselines belong to the studies, which this package must not import. `find_method` loads theirs by name when a run
-# asks for one: the only way from here to there, and one that no import statement shows.
+# requests one: the only link from here to there, and one that no import statement shows.
 BASELINES = "biresnerf.studies.baselines.methods"
 
 

@@ -57,7 +57,9 @@ def gains(renderer: Renderer, sampler: PhotoSampler) -> Array:
     for part in torch.arange(len(batch.image), device=renderer.device).split(GAIN_RAYS * 32):
         image = batch.image[part]
         rendering = renderer.render(*renderer.cast(matrices[image], image, batch.xy[part]))
-        seen = (rendering.opacity > 0.5).float() * batch.weight[part]  # the background shines as it likes
+        seen = (rendering.opacity > 0.5).float() * batch.weight[
+            part
+        ]  # the background may have any brightness
         for total, colour in ((shown, batch.sharp[part]), (rendered, rendering.colour)):
             values = (colour.mean(1) * seen).double().cpu().numpy()
             np.add.at(total, image.cpu().numpy(), values)

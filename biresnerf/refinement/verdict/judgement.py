@@ -113,7 +113,7 @@ def judge_poses(
     numbers, most = method.verdict, method.views.rounds_most
     refined = RefinedPoses.now(scene.dataset, joint)
     found = compare_without_training(scene, refined, lost, method)
-    # Only then it matters what the evidence determines: to know it, a matrix of all cameras is inverted.
+    # What the evidence determines matters only then; it takes the inverse of a matrix of all cameras.
     asked = matches_are_better(found.findings) and method.uncertainty
     errors = None
     if asked:

@@ -124,7 +124,7 @@ def barf_network(samples_per_ray: int | None) -> BuildField:
     def build(
         options: ResolvedOptions, frame: SceneFrame, device: torch.device, threads: int
     ) -> RadianceField:
-        torch.set_num_threads(threads)  # in plain torch, and the kernels are at rest
+        torch.set_num_threads(threads)  # in plain torch, and the kernels are idle
         return MlpField(
             options.seed,
             device,

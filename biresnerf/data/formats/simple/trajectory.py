@@ -91,10 +91,10 @@ _NAMED_TIME = re.compile(r"#\s*([-+0-9.eE]+)\s+(\S.*\S|\S)\s*$")
 
 
 class Trajectory:
-    """Poses in the file's order, called by their images, times or numbers; bad ones of a file without times included.
+    """Poses in the file's order, named by their images, times or numbers; bad ones of a file without times included.
 
-    ``times_s`` and the names of images by time are there where the file has them; ``left_out`` are bad lines, which
-    are no pose as they have a time or another number of words.
+    ``times_s`` and the names of images by time are there where the file has them; ``left_out`` are the bad lines of a
+    file with times.
     """
 
     def __init__(self, file: Path) -> None:

@@ -52,7 +52,7 @@ def without_copies(dataset: Dataset, keep: Sequence[str] = ()) -> Dataset:
     """
     copies = _stored_alike(dataset, keep)
     again = _compressed_again(dataset, [f for f in dataset.frames if f.name not in copies], keep)
-    # What was the original of a copy may be one itself.
+    # The original of a copy may be a copy itself.
     copies = {copy: again.get(original, original) for copy, original in (copies | again).items()}
     if not copies or len(dataset) - len(copies) < LEAST:
         return dataset

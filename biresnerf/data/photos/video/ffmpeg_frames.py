@@ -77,7 +77,7 @@ class FrameStream:
                             hint="Cut it: a few minutes around the scene are enough.",
                         )
                     yield frame
-                process.stdout.close()  # so that FFmpeg ends, should it have more to say
+                process.stdout.close()  # so that FFmpeg ends, even if it has more to write
                 process.wait(_TO_END_S)
                 ended = True
             finally:
