@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from benchmarks.gpu import report
+from benchmarks.large import made_aerial
 from benchmarks.method import peers
-from benchmarks.sets import made_aerial
 from benchmarks.sets.aerial_ground import render
 from benchmarks.speed.clock import timed
 from biresnerf.data.model.dataset import Dataset, Frame, SourceFormat

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.method.camera_rigs import CAMERA, OFF, OFF_RAD, SIZE, Rig
+from benchmarks.large.camera_rigs import CAMERA, OFF, OFF_RAD, SIZE, Rig
 from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.refinement.adjustment.cameras import Cameras
 from biresnerf.refinement.adjustment.solver.solve import CONVERGED, ROUNDS, SETTLED

@@ -43,7 +43,7 @@ PHOTO_TRIALS = 2
 # 6.9, 10.6 to 16.6, and 11.0 to 12.1 s.
 ADJUSTMENT = 140.0
 # The same of each of 1,000 cameras, and more of each of more, as the fronts of a flight grow: three adjustments and
-# five covariances, of 20 and 2 s (`benchmarks.method.many_cameras`), less what their observations take.
+# five covariances, of 20 and 2 s (`benchmarks.large.many_cameras`), less what their observations take.
 EACH_ADJUSTED = 0.8
 OBSERVED = 0.5  # of a photo's features, of tracks: 0.4 to 0.8 in these sets
 # Trial steps that take as long as the rest of a verdict: fox's took 3.5 s without its training, 2.2 of them renders

@@ -76,5 +76,12 @@ def taken_along_a_path(world_from_cam: NDArray[np.float64]) -> bool:
 def pose_distances(world_from_cam: NDArray[np.float64]) -> NDArray[np.float64]:
     """How far any two poses [n, n] are apart: their centres, in distances of the scene, and their viewing axes."""
     centres = world_from_cam[:, :3, 3] / max(focus_point(world_from_cam).mean_distance, 1e-12)
-    apart: NDArray[np.float64] = np.linalg.norm(centres[:, None] - centres[None], axis=2)
-    return apart + np.linalg.norm(world_from_cam[:, None, :3, 2] - world_from_cam[None, :, :3, 2], axis=2)
+    return _between_any(centres) + _between_any(world_from_cam[:, :3, 2])
+
+
+def _between_any(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distances [n, n] between points [n, 3], coordinate by coordinate: of thousands, [n, n, 3] is too large."""
+    squared = np.zeros((len(points), len(points)))
+    for values in points.T:
+        squared += (values[:, None] - values) ** 2
+    return np.asarray(np.sqrt(squared))

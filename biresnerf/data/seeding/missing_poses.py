@@ -73,6 +73,8 @@ def guess_missing(
     if not known.any():
         raise ValueError("no pose is known to guess others from")
     sources: list[PoseSource | None] = [None] * len(known)
+    if known.all():
+        return sources
     order = natural_order(names)
     on_path = taken_along_a_path(world_from_cam[[i for i in order if known[i]]])
     alike: NDArray[np.float32] | None = None

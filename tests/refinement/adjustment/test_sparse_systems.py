@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.method.camera_rigs import rig
+from benchmarks.large.camera_rigs import rig
 from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.refinement.adjustment.adjustment import adjust_poses, patch_term
 from biresnerf.refinement.adjustment.cameras import Cameras

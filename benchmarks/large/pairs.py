@@ -1,4 +1,4 @@
-"""How many of the pairs of photos that match are tried: ``python -m benchmarks.method.pairs SET... [--photos 150]``.
+"""How many of the pairs of photos that match are tried: ``python -m benchmarks.large.pairs SET... [--photos 150]``.
 
 Each SET holds true poses. All pairs are matched with the product's features; a pair is true if its matches fit one
 relative pose whose rotation is within `NEAR_DEG` of the truth's. Prints a JSON line for each rule by which the product

@@ -1,6 +1,6 @@
 """A drone's photos of a synthetic neighbourhood, with exact truth: for hundreds to thousands of photos.
 
-    python -m benchmarks.sets.made_aerial OUT --photos 500 [--width 1000] [--poses]
+    python -m benchmarks.large.made_aerial OUT --photos 500 [--width 1000] [--poses]
     biresnerf refine OUT --output RESULT
     biresnerf evaluate RESULT OUT.truth.json
 

@@ -1,4 +1,4 @@
-"""Time and accuracy of adjusting many cameras: ``python -m benchmarks.method.many_cameras``.
+"""Time and accuracy of adjusting many cameras: ``python -m benchmarks.large.many_cameras``.
 
 ``--shapes ring corridor aerial --counts 100 300 1000 3000 --by sparse dense ceres``: the rigs of `camera_rigs`, each
 adjusted in its own process, on one thread, by our fronts, by one dense system (``dense``, the same code with all
@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.method.camera_rigs import NOISE_PX, SHAPES, Rig, rig
+from benchmarks.large.camera_rigs import NOISE_PX, SHAPES, Rig, rig
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_by_spread
 from biresnerf.refinement.adjustment.adjustment import adjust_poses
@@ -125,7 +125,7 @@ def main() -> None:
                 command = [
                     sys.executable,
                     "-m",
-                    "benchmarks.method.many_cameras",
+                    "benchmarks.large.many_cameras",
                     "--shapes",
                     shape,
                     "--counts",

@@ -1,0 +1,1 @@
+"""Sets of hundreds to thousands of photos: made, matched, adjusted."""
