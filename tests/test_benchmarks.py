@@ -1,4 +1,4 @@
-"""What the benchmarks measure and gather is what they say."""
+"""The benchmarks measure and collect what they claim."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The house's limits, which keep every file readable at once; docs/architecture.md gives the reasons."""
+"""The project's limits, which keep every file readable at once; docs/architecture.md gives the reasons."""
 
 from __future__ import annotations
 

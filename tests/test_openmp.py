@@ -1,4 +1,4 @@
-"""Jobs side by side do not take each other's cores by waiting."""
+"""Concurrent jobs do not occupy each other's cores by busy waiting."""
 
 from __future__ import annotations
 

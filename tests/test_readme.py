@@ -1,4 +1,4 @@
-"""What the README and the pages say of options and files is so."""
+"""What the README and the pages say about options and files is true."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A result as Python sees it, against the files that it was made of."""
+"""A result in Python, against the files that it is read from."""
 
 from __future__ import annotations
 

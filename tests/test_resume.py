@@ -1,4 +1,4 @@
-"""Which earlier work a run may go on from: its own, and the first stage of one that differs only after it."""
+"""Which earlier work a run may resume: its own, and stage 1 of a run that differs only later."""
 
 from __future__ import annotations
 

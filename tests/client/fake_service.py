@@ -1,4 +1,4 @@
-"""An `AsyncClient` whose service is a function of this process."""
+"""An `AsyncClient` connected to a fake service, a function in this process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Downloads that their caller ends: no file is half there, and the next one goes on."""
+"""Downloads that their caller cancels: they leave no partial file, and the next one resumes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every command owes its users."""
+"""Rules that every command follows."""
 
 from __future__ import annotations
 

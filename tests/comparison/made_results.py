@@ -1,4 +1,4 @@
-"""Results made from true poses: how far each is off is known, and its figures follow from that."""
+"""Results made from true poses: their errors are known, and their figures follow from these."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What other programs read: their own readers, in an environment of their own."""
+"""Our files in other programs' own readers, in a separate environment."""

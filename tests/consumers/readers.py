@@ -1,4 +1,4 @@
-"""Readers of other programs, run as they are: `python readers.py PROGRAM FILE`. Prints what was read, as JSON.
+"""Readers of other programs, run unmodified: `python readers.py PROGRAM FILE`. Prints what was read, as JSON.
 
 Runs in the environment of `make consumers-check`, which has none of this project's code. Poses are world_from_cam with
 OpenCV axes, by the name that the program gives to the image.

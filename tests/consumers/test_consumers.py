@@ -1,4 +1,4 @@
-"""What other programs' own readers make of what is written: poses, lenses, points, each against the truth.
+"""Other programs' readers open what we write: poses, lenses and points, each against the truth.
 
 `make consumers-check` builds their environment and runs this file. Programs that are published as source only are read
 from checkouts in $BIRESNERF_CONSUMER_SOURCES (gaussian-splatting, gsplat, nerf-pytorch).

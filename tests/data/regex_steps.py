@@ -1,7 +1,7 @@
 """Counts what regular expressions do: steps of a backtracking matcher, the same on every machine.
 
-The expressions are matched once more by a matcher of our own, which has to find what Python's finds. It tries
-alternatives in the same order, so that it takes as many steps for each character, up to a factor.
+Our own matcher matches the expressions again and must find what Python's finds. It tries alternatives in the same
+order, so its steps per character are the same up to a factor.
 """
 
 from __future__ import annotations

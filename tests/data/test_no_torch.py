@@ -1,4 +1,4 @@
-"""The data room works without torch: the service validates uploads with it."""
+"""The package `biresnerf.data` works without torch: the service validates uploads with it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Real and published image sets: they read, load and write back the same. Third parties' material, never here."""
+"""Real and published image sets: they read, load and write back the same. Third-party material, not kept here."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What KEDA and Kueue demand of the objects that we give them, in our own words, as JSON schemas.
+"""Our own JSON schemas of the objects that we give to KEDA and Kueue.
 
 Written after scaledjob_types.go, scaletriggers_types.go and triggerauthentication_types.go in apis/keda/v1alpha1 and
 pkg/scalers/postgresql_scaler.go of https://github.com/kedacore/keda at commit 8b4f083 (August 2026), and after

@@ -1,4 +1,4 @@
-"""The proxy of compose.yaml: what deploy/proxy/start.sh decides, and what nginx refuses of itself."""
+"""The proxy of compose.yaml: what deploy/proxy/start.sh decides, and what nginx itself refuses."""
 
 from __future__ import annotations
 

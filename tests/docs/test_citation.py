@@ -1,4 +1,4 @@
-"""What is said of the project in one file is what is said of it in the others."""
+"""All files say the same about the project."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pages and notebooks that are made of the code are as the code has them."""
+"""Pages and notebooks that are generated from the code are up to date."""
 
 from __future__ import annotations
 

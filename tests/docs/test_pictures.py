@@ -1,4 +1,4 @@
-"""The pictures of the pages: each is used, made by a command of the repository, small, and said in words."""
+"""The pictures of the pages: each is used, made by a command of the repository, small, and described in words."""
 
 from __future__ import annotations
 

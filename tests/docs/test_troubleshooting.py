@@ -1,4 +1,4 @@
-"""The page of troubles names every error that users can meet, and nothing that there is not any more."""
+"""The troubleshooting page names every error that users can meet, and none that no longer exists."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The example in TypeScript fits the types that the generator of the page makes of the API's description."""
+"""The TypeScript example type-checks against the types that its page's generator makes from the API's description."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The occupancy grid that never asks the device how many cells an update concerns, against the one that does."""
+"""The occupancy grid that never queries the device for the number of cells to update, against the one that does."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Epipolar errors: nothing for true poses, the gauge has no say, and the size is that of the error in the image."""
+"""Epipolar errors: zero for true poses, independent of the gauge, and as large as the error in the image."""
 
 from __future__ import annotations
 

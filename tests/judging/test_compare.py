@@ -1,4 +1,4 @@
-"""The one comparison: intervals and findings are those of Student's test, and chance has its share and no more."""
+"""The comparison: intervals and findings are those of Student's test, with its rate of false findings."""
 
 from __future__ import annotations
 

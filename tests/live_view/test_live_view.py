@@ -1,4 +1,4 @@
-"""The live view of a real viser server, as a client is told of it over the websocket."""
+"""The live view of a real viser server, as a client receives it over the websocket."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Declarations of formats: read without their modules, and the same as the modules have them."""
+"""Declarations of formats: read without loading their modules, and equal to the modules' own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Options as they are asked for, as they are resolved, and what each of them says of itself."""
+"""Options as requested and as resolved, and the declaration of each."""
 
 from __future__ import annotations
 

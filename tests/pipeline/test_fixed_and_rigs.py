@@ -1,4 +1,4 @@
-"""A whole run with cameras that must stay, and one of a rig: what the files say at the end."""
+"""A whole run with fixed cameras, and one with a rig: the files at the end."""
 
 from __future__ import annotations
 

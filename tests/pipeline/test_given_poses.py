@@ -1,4 +1,4 @@
-"""A run on poses that mean something else than their format says warns of it, and reads them as the user says."""
+"""A run warns of poses that do not follow their format's conventions, and reads them as the user says."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A set that is accepted at the beginning of a job does not break its end, whatever its numbers are.
+"""A set that is accepted at the start of a job does not make it fail at the end, whatever its numbers are.
 
 ``BIRESNERF_HOSTILE_SETS=500 pytest tests/pipeline/test_hostile_sets.py`` tries that many.
 """

@@ -1,4 +1,4 @@
-"""What a run may remove from the folder of its results: what a finished run wrote there, and nothing of the user's."""
+"""A run removes from its output folder only what a finished run wrote there, never the user's files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The whole method on a scene with exact truth: poses are recovered, and every result says the same."""
+"""The whole method on a scene with exact truth: poses are recovered, and all result files agree."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run shows while COLMAP works, on photos of which nothing is known."""
+"""What a run shows while COLMAP works, on photos without poses and lenses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every way to start, on photos with all that cameras write, some of them turned: poses against the truth."""
+"""Every way to start, on photos with all camera metadata, some of them turned: poses against the truth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run leaves where refinement did not help, and that a verdict cut short is passed when the run goes on."""
+"""What a run leaves if refinement did not help; an interrupted verdict is reached when the run resumes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The numbers that decide what a run does: all are explained and read, and a run heeds what the method has for them."""
+"""The numbers that decide what a run does: all are explained and used, and a run follows the method's values."""
 
 from __future__ import annotations
 

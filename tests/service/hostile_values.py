@@ -1,4 +1,4 @@
-"""Values that services fall over, in bodies, paths and headers."""
+"""Values that often break services, in bodies, paths and headers."""
 
 from __future__ import annotations
 

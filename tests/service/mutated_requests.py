@@ -1,7 +1,7 @@
 """Requests made from the OpenAPI document, with one or a few hostile values each, sent as bytes over many connections.
 
-Some hundred a second, where schemathesis sends a few: it looks closely at each answer, this looks for server errors and
-for what an answer must not tell.
+Sends some hundred a second; schemathesis sends a few, but checks each answer closely. This looks for server errors and
+for information that an answer must not reveal.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Sets in which no frame is spare: three frames, so that a bad one refuses the set."""
+"""Sets of only three frames, so that one bad frame makes the whole set refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A disk that is nearly full is refused, not hit."""
+"""When the disk is nearly full, requests are refused before it fills up."""
 
 from __future__ import annotations
 

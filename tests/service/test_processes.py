@@ -1,4 +1,4 @@
-"""Two web processes on one port: what each knows alone must not show."""
+"""Two web processes on one port: the state of a single one must not show."""
 
 from __future__ import annotations
 

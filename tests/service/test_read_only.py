@@ -1,4 +1,4 @@
-"""A disk that became read-only: nothing is taken in, what is there can be fetched, and jobs wait for it."""
+"""A disk that became read-only: uploads are refused, existing files can be downloaded, and jobs wait."""
 
 from __future__ import annotations
 

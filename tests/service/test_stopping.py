@@ -1,4 +1,4 @@
-"""What a service that is told to stop answers to who waits for it."""
+"""The responses of a stopping service to waiting clients."""
 
 from __future__ import annotations
 

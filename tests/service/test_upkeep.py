@@ -1,4 +1,4 @@
-"""What the web process brings to an end by itself: trash and tallies without workers, and checks that were left."""
+"""Work that the web process finishes itself: trash and tallies without workers, and abandoned checks."""
 
 from __future__ import annotations
 

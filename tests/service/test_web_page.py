@@ -1,4 +1,4 @@
-"""The page is answered as browsers should keep and confine it."""
+"""The page has the right headers for caching and confinement."""
 
 from __future__ import annotations
 

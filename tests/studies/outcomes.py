@@ -1,4 +1,4 @@
-"""Results of runs that never ran: real pose errors of rigs with known noise, made-up times."""
+"""Made-up results of runs: real pose errors of rigs with known noise, made-up times."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One cell from start to end, in this process: from poses that know nothing, on a scene without test views."""
+"""One cell from start to end, in this process: from identity poses, on a scene without test views."""
 
 from __future__ import annotations
 

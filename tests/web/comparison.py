@@ -1,4 +1,4 @@
-"""What the page says of two jobs, against their own files."""
+"""The page's comparison of two jobs, against their files."""
 
 from __future__ import annotations
 

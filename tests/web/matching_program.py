@@ -1,7 +1,7 @@
 """A job program for the tests of the page: finds ever more matches in a set, as COLMAP might, until it is ended.
 
-The protocol of `workers.run.job_process` and the library's own previews; no COLMAP, no torch. Where the given poses
-are to be taken, which need no matches, the real program takes over.
+The protocol of `workers.run.job_process` and the library's own previews; no COLMAP, no torch. If the given poses are to
+be used, which need no matches, the real program takes over.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What is built of the page reaches for nothing outside, and is of the sources as they are."""
+"""The built page loads nothing from outside, and is up to date with its sources."""
 
 from __future__ import annotations
 

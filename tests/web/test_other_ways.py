@@ -1,4 +1,4 @@
-"""What goes another way than the walk: broken connections, sets that are refused, jobs that fail, many jobs."""
+"""Cases beside the usual walk: broken connections, sets that are refused, jobs that fail, many jobs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A page under watch: what it asks for, what it complains of, and what is wrong with how it can be read and used."""
+"""A page under watch: its requests, its errors, and its faults in accessibility and layout."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A job program that counts: the same protocol as `workers.run.job_process`, with faults on order and without torch.
+"""A job program that counts: the same protocol as `workers.run.job_process`, with faults on request and without torch.
 
 The dataset's ``plan.json`` says how many steps, how long each takes and what goes wrong.
 """

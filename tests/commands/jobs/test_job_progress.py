@@ -1,4 +1,4 @@
-"""Progress where standard error is no terminal, and what it is made of."""
+"""Progress output without a terminal, and its content."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Completion as the shells ask for it."""
+"""Shell completion, as the shells request it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`biresnerf compare-results` on a real result, and on what it would be had it kept the input's poses."""
+"""`biresnerf compare-results` on a real result, and on a variant of it that kept the input's poses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`biresnerf convert`: there and back, poses and names are what they were."""
+"""`biresnerf convert`: a round trip keeps poses and names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`biresnerf convert` for programs with habits of their own: where photos lie, in which order, and with which lens."""
+"""`biresnerf convert` for programs with special rules for the photos' folder, order and lens."""
 
 from __future__ import annotations
 

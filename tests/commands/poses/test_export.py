@@ -1,4 +1,4 @@
-"""`biresnerf export`: a finished result, read back from its folder, in every other form."""
+"""`biresnerf export`: a finished result, read back from its folder, in every other format."""
 
 from __future__ import annotations
 

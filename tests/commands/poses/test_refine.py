@@ -1,4 +1,4 @@
-"""The real `biresnerf refine` process: what it says of bad input, and how it ends and goes on when killed."""
+"""The real `biresnerf refine` process: errors for bad input, and how it ends and resumes when killed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sets with photos on disk for readers: what is read must be the poses and lenses that the file was made from."""
+"""Sets with photos on disk for readers: reading must return the poses and lenses that the file was made from."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Random results and models, of every camera model there is; nothing special about them."""
+"""Random results and models, of every camera model."""
 
 from __future__ import annotations
 

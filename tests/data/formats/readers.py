@@ -1,4 +1,4 @@
-"""Small readers of the formats, written from the formats' rules and not from the writers; projections through them.
+"""Small readers of the formats, written from the formats' rules, independently of the writers, with projections.
 
 Each reader gives, for image i in the caller's order, a function from points in the world [m, 3] to pixels [m, 2].
 """

@@ -1,4 +1,4 @@
-"""Folders: what is read of them, and what is not passed over in silence."""
+"""Folders: what is read of them, and what is reported instead of silently ignored."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Poses and photos that do not lie beside each other in the set's folder are found, and what was taken is said."""
+"""Poses and photos that do not lie beside each other in the set's folder are found, and the choice is reported."""
 
 from __future__ import annotations
 

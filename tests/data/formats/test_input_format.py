@@ -1,4 +1,4 @@
-"""What came in one form goes out in it; and transforms.json made anew keeps to nerfstudio's rules."""
+"""Results keep the input's format; a new transforms.json follows nerfstudio's rules."""
 
 from __future__ import annotations
 

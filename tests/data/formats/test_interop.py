@@ -1,4 +1,4 @@
-"""Small cases of other programs' sets that went wrong once: each is read right, or refused in words that name it."""
+"""Small cases of other programs' sets that went wrong once: each is read correctly, or refused by name."""
 
 from __future__ import annotations
 

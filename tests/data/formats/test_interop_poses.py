@@ -1,4 +1,4 @@
-"""Sets of other programs with their true poses beside them: each is read at these."""
+"""Sets of other programs with true poses: each is read at these poses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pose files that other programs wrote themselves: read as an independent reading of the same file has them."""
+"""Pose files that other programs wrote themselves: read as an independent reader does."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every format, read by its format's own rules, puts points where we do; and says why where it cannot."""
+"""Every format, read by its own rules, projects points as we do, or says why it cannot."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Poses of other programs that are not read are named, and what only looks like them is not."""
+"""Unsupported pose files of other programs are named; files that only look like them are not."""
 
 from __future__ import annotations
 

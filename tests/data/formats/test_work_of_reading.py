@@ -1,4 +1,4 @@
-"""Files of strangers take work as their size, whatever is in them: steps of regular expressions, names compared."""
+"""Reading strangers' files takes work in proportion to their size: steps of regular expressions, names compared."""
 
 from __future__ import annotations
 

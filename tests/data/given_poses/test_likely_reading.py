@@ -1,4 +1,4 @@
-"""Photos tell whether given poses mean what their format says; a question is asked if they do not, and only then."""
+"""Photos show whether given poses follow their format's conventions; the user is asked only if they do not."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each mistake that people make when they write poses is undone by the reading of its name."""
+"""Each common mistake in written poses is undone by the reading that is named after it."""
 
 from __future__ import annotations
 

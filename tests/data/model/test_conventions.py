@@ -1,4 +1,4 @@
-"""File conventions: they undo each other, and quaternions agree with scipy's."""
+"""File conventions: reading inverts writing, and quaternions agree with scipy's."""
 
 from __future__ import annotations
 

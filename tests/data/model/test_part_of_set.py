@@ -1,4 +1,4 @@
-"""A set without some of its photos is the set that never had them."""
+"""A set from which photos were removed equals one that never had them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Strict JSON: whatever the bytes are, an object comes out or an error that says what to fix."""
+"""Strict JSON: any bytes give an object, or an error that says what to fix."""
 
 from __future__ import annotations
 

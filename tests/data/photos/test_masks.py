@@ -1,4 +1,4 @@
-"""Masks: which pixels count, in whatever form the mask comes; at working size only what wholly counts does."""
+"""Masks in any form: which pixels count; at working size, only those that count completely."""
 
 from __future__ import annotations
 

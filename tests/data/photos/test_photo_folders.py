@@ -1,4 +1,4 @@
-"""What lies beside photos and is none: maps of them, masks, small copies, kinds that are not read."""
+"""Files beside photos that are none: maps of them, masks, small copies, unsupported kinds."""
 
 from __future__ import annotations
 

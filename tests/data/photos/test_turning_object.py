@@ -1,4 +1,4 @@
-"""What tells photos of something that turns from others: their order, and a background that stays."""
+"""Photos of a turning object are recognised by their order and a static background."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Points of a result: triangulated from the refined cameras, to the truth where the truth is known; never stale."""
+"""Points of a result: triangulated from the refined cameras, compared with the truth; never stale."""
 
 from __future__ import annotations
 

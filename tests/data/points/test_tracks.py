@@ -1,4 +1,4 @@
-"""Tracks: one point's features in all photos that show it; whole after thinning, the same again after a break."""
+"""Tracks: one point's features in all photos that show it; kept whole by thinning, restored after a break."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What all given poses lack on the camera's side: taken back in the caller's world, and said by its name."""
+"""A common offset of all given poses from the cameras is removed in the caller's world, and named."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Models that matches gave, carried into the frame of given poses: which cameras are believed there."""
+"""Models from matches, moved into the frame of given poses: which of their cameras are trusted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How many features are looked for, and that their photos are numbered in order however many threads look."""
+"""How many features are extracted, and that photos are numbered in order with any number of threads."""
 
 from __future__ import annotations
 

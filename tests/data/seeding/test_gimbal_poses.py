@@ -1,4 +1,4 @@
-"""Photos that no feature matches placed begin where GPS and a drone's gimbal say, in the frame of the others."""
+"""Photos that matches did not place start at the poses of GPS and a drone's gimbal, in the others' frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Poses by feature matches for photos with all that cameras write: as exact as for bare ones, in the right frame."""
+"""Poses from feature matches for photos with all camera metadata: as exact as without, in the right frame."""
 
 from __future__ import annotations
 

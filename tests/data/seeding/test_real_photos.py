@@ -1,4 +1,4 @@
-"""What feature matches make of real photos as cameras write them, or as people leave them, against the truth."""
+"""Feature matches on real photos, as cameras write or users leave them, against the truth."""
 
 from __future__ import annotations
 

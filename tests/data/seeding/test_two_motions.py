@@ -1,4 +1,4 @@
-"""An object that is turned before a still backdrop: two motions in a pair of photos, of which one is no camera's."""
+"""An object that turns before a static backdrop: two motions in a pair of photos, one of which is not the camera's."""
 
 from __future__ import annotations
 

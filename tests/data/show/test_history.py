@@ -1,4 +1,4 @@
-"""The curve of a run: one line a check, whole again after a kill."""
+"""The curve of a run: one line per check, consistent after a kill."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures for people: what is written reads back as what was meant."""
+"""Pictures for people read back with the intended content."""
 
 from __future__ import annotations
 

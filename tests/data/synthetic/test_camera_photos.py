@@ -1,4 +1,4 @@
-"""Photos as cameras write them: what viewers, COLMAP and our own readers make of them, against the scene."""
+"""Photos with camera metadata: how viewers, COLMAP and our readers interpret them, against the scene."""
 
 from __future__ import annotations
 

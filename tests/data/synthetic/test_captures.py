@@ -1,4 +1,4 @@
-"""Sets as people bring them: rendered exactly, written as phones and COLMAP do, and wrong in the way they say."""
+"""Sets as users bring them: rendered exactly, written as by phones and COLMAP, with the stated errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The still life: exact surfaces, one colour per point in all views, and shadows where something is in the way."""
+"""The still life: exact surfaces, one colour per point in all views, and shadows where something blocks the light."""
 
 from __future__ import annotations
 

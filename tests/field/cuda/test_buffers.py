@@ -1,4 +1,4 @@
-"""Memory of the CUDA kernels: what a buffer held before has no say, and nothing is written beside it."""
+"""Memory of the CUDA kernels: a buffer's old content does not matter, and nothing is written outside of it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The CUDA kernels compile, also for arguments that are not aligned, and take what a GPU has."""
+"""The CUDA kernels compile, also for arguments that are not aligned, and fit a GPU's resources."""
 
 from __future__ import annotations
 

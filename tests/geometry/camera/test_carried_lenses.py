@@ -1,4 +1,4 @@
-"""Lenses that others carry: how far from COLMAP's they are, and how a refined one becomes one of its formula again."""
+"""Lenses represented by other models: how far they are from COLMAP's, and how refined ones are converted back."""
 
 from __future__ import annotations
 

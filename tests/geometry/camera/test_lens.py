@@ -1,4 +1,4 @@
-"""Lenses that no pixel can be seen through: against the radial function written out, and a dense grid."""
+"""Lenses through which pixels have no viewing ray: against the radial function written out, and a dense grid."""
 
 from __future__ import annotations
 

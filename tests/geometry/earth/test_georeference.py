@@ -1,4 +1,4 @@
-"""Cameras are carried to measured positions where these tell the frame, and nothing is claimed where they do not."""
+"""Cameras are moved to measured positions if these determine the frame; otherwise nothing is claimed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The choice between sets of poses: by what they were not fitted to, and for the first on a tie."""
+"""The choice between sets of poses: by evidence to which they were not fitted; the first wins a tie."""
 
 from __future__ import annotations
 

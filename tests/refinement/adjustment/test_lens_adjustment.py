@@ -1,4 +1,4 @@
-"""Lenses in the adjustment: recovered where the evidence tells, kept where it does not."""
+"""Lenses in the adjustment: recovered where the evidence determines them, else kept."""
 
 from dataclasses import replace
 

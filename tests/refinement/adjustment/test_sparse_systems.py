@@ -1,4 +1,4 @@
-"""Cameras that see what is near them: systems eliminated front by front are those of one dense matrix."""
+"""Cameras with local views: elimination front by front gives the same as one dense matrix."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The input's poses as evidence: how accurate they are is measured, and what is known so is used."""
+"""The input's poses as evidence: their accuracy is measured, and they are used accordingly."""
 
 import math
 

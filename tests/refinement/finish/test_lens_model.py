@@ -1,4 +1,4 @@
-"""Which parameters of an unknown lens are freed: those that tracks tell, and that tracks left out want."""
+"""Which parameters of an unknown lens are freed: those that tracks determine and left-out tracks confirm."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""A run with a time budget takes as many steps as fit, and says where even few do not."""
+"""A run with a time budget takes as many steps as fit, and says so if even few do not."""
 
 import math
 import time

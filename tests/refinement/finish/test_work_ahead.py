@@ -1,4 +1,4 @@
-"""What a run has before it follows from the set, the options, and how far it is."""
+"""A run's remaining work follows from the set, the options, and its progress."""
 
 from dataclasses import replace
 

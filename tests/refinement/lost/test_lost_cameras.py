@@ -1,4 +1,4 @@
-"""Lost cameras come home: on the synthetic scene, from half a turn in place and from far round the scene."""
+"""Lost cameras are recovered on the synthetic scene, from half a turn in place and from far around the scene."""
 
 from __future__ import annotations
 

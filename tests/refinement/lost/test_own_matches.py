@@ -1,4 +1,4 @@
-"""A camera's own matches name it where it is lost, and place it; what they cannot tell, they leave."""
+"""A lost camera's own matches identify it and place it; where they cannot, nothing is changed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Outside of the field's kernels, a step never makes the host wait for a GPU. Shown without one, see `traced_step`."""
+"""Outside of the field's kernels, a step never makes the host wait for a GPU. Shown without a GPU: `traced_step`."""
 
 from __future__ import annotations
 

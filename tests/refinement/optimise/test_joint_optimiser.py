@@ -1,4 +1,4 @@
-"""One step and the switch: the function is untouched by it, held-out photos never reach the field."""
+"""One step, and the switch, which leaves the function unchanged; held-out photos never reach the field."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every method runs the whole way on the same loop, and goes on after a stop as if there was none."""
+"""Every method runs to its end on the same loop, and resumes after a stop as if there had been none."""
 
 from __future__ import annotations
 

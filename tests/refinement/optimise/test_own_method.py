@@ -1,4 +1,4 @@
-"""A method of one's own: loss, schedule and field from a file elsewhere, and ours with parts left out."""
+"""A user's own method: loss, schedule and field from a file elsewhere, and ours with parts left out."""
 
 from __future__ import annotations
 

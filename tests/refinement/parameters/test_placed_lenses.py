@@ -1,4 +1,4 @@
-"""Lenses that were found otherwise than by photos, as parameters of the optimisation."""
+"""Lenses that were not found by photos, as parameters of the optimisation."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Poses from none, for photos that look the same way: a rig before a relief, and its mirror image."""
+"""Poses from scratch for forward-facing photos: a rig before a relief, and its mirror image."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The order of photos around an object: as named, or put together from runs that were turned and laid on their side."""
+"""The order of photos around an object: as named, or assembled from sequences, some reversed or taken sideways."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Poses from none for something that turns once before the camera: which way, from how high, in uneven steps."""
+"""Poses from scratch for an object that turns once before the camera: direction, elevation, uneven steps."""
 
 from __future__ import annotations
 

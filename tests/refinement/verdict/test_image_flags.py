@@ -1,4 +1,4 @@
-"""Photos that tell on themselves: blurred, exposed otherwise than the others, moved by far more than they."""
+"""Suspicious photos are flagged: blurred, differently exposed, or moved far more than the others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The verdict on poses of known truth: the better set wins, whichever side it is on, and photos tell on themselves."""
+"""The verdict on poses of known truth: the better set wins on either side, and suspicious photos are flagged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What feature matches say of two sets of poses, of which one is true."""
+"""Feature matches as evidence on two sets of poses, one of which is true."""
 
 from __future__ import annotations
 

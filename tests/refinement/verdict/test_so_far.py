@@ -1,4 +1,4 @@
-"""What a run offers before its end: the best poses it came to, by matches; never the input's made worse."""
+"""What a run offers before its end: the best poses so far, by matches, and never worse than the input's."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A wire between client and service that can be cut."""
+"""A relay between client and service that can be cut."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The client's way of sending, through connections that break."""
+"""The client's uploads over connections that break."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Examples are made of those of the fields, so no model needs one of its own."""
+"""Models' examples are built from those of their fields."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The interface as the checked-in document tells it."""
+"""The checked-in OpenAPI document matches the service."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two tenants on one service: neither sees, guesses or touches what is the other's, on any route there is."""
+"""Two tenants on one service: neither sees, guesses or touches the other's data, on any route."""
 
 from __future__ import annotations
 

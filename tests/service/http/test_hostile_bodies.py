@@ -1,4 +1,4 @@
-"""JSON, images and archives made to hurt. The `http` fixture checks that the service goes on and nothing stays."""
+"""Malicious JSON, images and archives. The `http` fixture checks that the service survives and nothing is left."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the log of the service tells of a request: enough for an audit, nothing that is secret."""
+"""The service's log of a request: enough for an audit, but no secrets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""More requests than one process can take at once: what it says to whom it turns away."""
+"""More requests than one process accepts at once: its responses to those refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is refused of a request before any route sees it, and what a link to a job opens: no database is asked."""
+"""Requests refused before any route sees them, and what a link to a job opens; needs no database."""
 
 from __future__ import annotations
 

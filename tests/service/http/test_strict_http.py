@@ -1,4 +1,4 @@
-"""Requests that no client of good will sends, byte by byte over a socket."""
+"""Malformed and malicious requests, byte by byte over a socket."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Uploads at the same time: how many a key may send, and how those that arrived wait for each other."""
+"""Concurrent uploads: how many a key may send, and how received ones wait their turn."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A child that tells what it was given and may use, or never ends."""
+"""A child program that reports its environment and limits, or never ends."""
 
 from __future__ import annotations
 

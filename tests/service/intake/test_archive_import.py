@@ -1,4 +1,4 @@
-"""Hostile and broken archives over HTTP. The `http` fixture checks that the service goes on and nothing stays."""
+"""Hostile and broken archives over HTTP. The `http` fixture checks that the service survives and nothing is left."""
 
 from __future__ import annotations
 

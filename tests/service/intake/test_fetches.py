@@ -1,4 +1,4 @@
-"""Sets by address over HTTP: what is wrong with a file is said by its name, and finalizing waits for all of them."""
+"""Sets fetched from addresses, over HTTP: errors name their file, and finalizing waits for all files."""
 
 from __future__ import annotations
 

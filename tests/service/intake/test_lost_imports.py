@@ -1,4 +1,4 @@
-"""An upload that takes web processes down is given up; kills and restarts that it has no part in cost it nothing."""
+"""An upload that kills web processes is given up; unrelated kills and restarts do not count."""
 
 from __future__ import annotations
 

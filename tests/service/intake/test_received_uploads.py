@@ -1,4 +1,4 @@
-"""What has arrived is stored sooner or later, and one upload that cannot be does not keep others waiting."""
+"""Received uploads are stored eventually, and one that cannot be stored does not block others."""
 
 from __future__ import annotations
 

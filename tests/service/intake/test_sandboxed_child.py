@@ -1,4 +1,4 @@
-"""What the programs that read strangers' files know and may use."""
+"""What programs that read strangers' files can see and use."""
 
 from __future__ import annotations
 

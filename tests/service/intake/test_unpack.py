@@ -1,4 +1,4 @@
-"""Unpacking without a service around it: what comes out, and that no limit is passed by a byte or a file."""
+"""Unpacking without a service around it: the files, and that no limit is exceeded by a byte or a file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two jobs compared over HTTP: what the library says of their files."""
+"""Two jobs compared over HTTP, against the library's result on their files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What can be asked of a job beside its state: log, previews, partial result, rows, exports, forks, waiting."""
+"""What a job offers beside its state: log, previews, partial result, rows, exports, forks, waiting."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Copies of one job and its dataset, and what happens every hour: what a full database is tried with."""
+"""Copies of one job and its dataset, which fill a database, and the regular operations to try on it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Checks of datasets: once, by one process, and made again where they were cut short."""
+"""Checks of datasets: once, by one process, and repeated if they were interrupted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Many jobs in one call: all or none, and one end that is told once."""
+"""Many jobs in one call: all or none, and a single event at the end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One room writes SQL on the table `jobs`, and in it five modules change it."""
+"""Only one package has SQL on the table `jobs`, and five of its modules change it."""
 
 from __future__ import annotations
 

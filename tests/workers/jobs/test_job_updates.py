@@ -1,4 +1,4 @@
-"""Following a job: its history gapless, every change seen, by however many, from wherever they left off."""
+"""Following a job: a gapless history, every change seen, by any number of followers, from where they left off."""
 
 from __future__ import annotations
 

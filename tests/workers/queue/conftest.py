@@ -1,4 +1,4 @@
-"""Silent workers are taken for dead soon."""
+"""Silent workers soon count as dead."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lines that are dead while both their ends live, and workers taken for dead that are not."""
+"""Connections that are dead while both ends live, and living workers that counted as dead."""
 
 from __future__ import annotations
 

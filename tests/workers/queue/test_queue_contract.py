@@ -1,4 +1,4 @@
-"""What `workers.database.job_queue` needs of Procrastinate. Red here: read its changelog."""
+"""What `workers.database.job_queue` needs of Procrastinate. If this fails, read its changelog."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What becomes of a job between its start and its end: previews, a partial result, its log, less memory."""
+"""A job between its start and its end: previews, a partial result, its log, less memory."""
 
 from __future__ import annotations
 

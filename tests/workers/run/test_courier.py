@@ -1,4 +1,4 @@
-"""What is carried from a job's process to its record, with a ledger that only takes notes."""
+"""What is delivered from a job's process to its record, with a ledger that only records calls."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Secrets come from files, and what is wrong with one is said by its variable's name."""
+"""Secrets come from files, and errors name the variable."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is to be deleted is deleted, and a folder that cannot be does not keep others."""
+"""Listed folders are deleted, and one that cannot be deleted does not block others."""
 
 from __future__ import annotations
 

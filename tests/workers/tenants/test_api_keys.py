@@ -1,4 +1,4 @@
-"""Keys in the database: found by their text alone, and only while they live."""
+"""Keys in the database: found only by their text, and only while they are valid."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of jobs reach addresses of their owners', and what does not is said in the job, which stays as it is."""
+"""Files of jobs reach their owners' addresses; failures are recorded in the job, which is otherwise unchanged."""
 
 from __future__ import annotations
 

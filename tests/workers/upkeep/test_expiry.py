@@ -1,4 +1,4 @@
-"""What is over goes after its time, and only that: files deleted, records left for a while, each thing once."""
+"""Only what has expired is deleted: its files at once, records after a while, each thing once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Nothing a user names leads the service to an address inside; what is sent arrives where it was judged."""
+"""No user's address leads the service into internal networks; requests go to the address that was checked."""
 
 from __future__ import annotations
 

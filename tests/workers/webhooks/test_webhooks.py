@@ -1,4 +1,4 @@
-"""What webhooks are told, to whom, and signed how; an independent library reads the signatures."""
+"""Which messages webhooks get, from whom, and how they are signed; an independent library checks the signatures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Hostile and broken COLMAP models: each gets its clear error at once, none loads in silence or takes the memory."""
+"""Hostile and broken COLMAP models: each gets a clear error at once; none is accepted silently or exhausts memory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""COLMAP models with their images: poses, names, cameras, masks, and images that the model has not."""
+"""COLMAP models with their images: poses, names, cameras, masks, and images that the model lacks."""
 
 from __future__ import annotations
 

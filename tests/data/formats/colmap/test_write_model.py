@@ -1,4 +1,4 @@
-"""COLMAP's two forms: what is written reads back to the bit, here and in COLMAP, ids, rigs and all."""
+"""COLMAP's two forms: they read back bit by bit, here and in COLMAP, ids and rigs included."""
 
 from __future__ import annotations
 

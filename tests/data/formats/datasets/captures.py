@@ -1,4 +1,4 @@
-"""Writers of captures and benchmarks by their own programs' rules: five random poses and a lens each.
+"""Writers of capture and benchmark formats, by their programs' rules: five random poses and a lens each.
 
 Each writes the pose files into a folder and returns what they hold; photos are written apart.
 """

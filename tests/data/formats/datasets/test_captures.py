@@ -1,4 +1,4 @@
-"""Captures and benchmarks, each written by its own program's rules: poses, lenses and names are what they were.
+"""Captures and benchmarks, each written by its program's rules: poses, lenses and names are read back.
 
 Every case writes the same five poses and lenses, and reads them back with the library's own projection.
 """

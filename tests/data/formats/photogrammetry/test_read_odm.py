@@ -1,4 +1,4 @@
-"""shots.geojson of OpenDroneMap: what it means is what its own source makes of OpenSfM's reconstruction."""
+"""shots.geojson of OpenDroneMap, interpreted as its source derives it from OpenSfM's reconstruction."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""reconstruction.json of OpenSfM: what it means is what its own source makes of it."""
+"""reconstruction.json of OpenSfM, interpreted as by its source."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""cameras.sfm of Meshroom and sfm_data.json of OpenMVG: each version means what its loader makes of it."""
+"""cameras.sfm of Meshroom and sfm_data.json of OpenMVG: each version is interpreted as by its loader."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of photogrammetry programs and of NeuS, read by those programs' rules: points project where they do for us."""
+"""Files of photogrammetry programs and of NeuS, read by those programs' rules: points project as ours do."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What VGGT, Depth Anything 3 and DUSt3R do with photos, as their sources say, done to pictures of coordinates.
+"""The preprocessing of photos by VGGT, Depth Anything 3 and DUSt3R, after their sources, on coordinate images.
 
-Each photo is two channels that hold the x and y of every pixel's middle. What is left of them after scaling, cropping
-and padding tells where in the picture the photo lies, without a formula for it.
+Each photo is two channels with the x and y of every pixel's centre. After scaling, cropping and padding, they show
+where in the picture the photo lies, without a formula for it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Undistorted photos: each pixel shows what its ray met in the photo, by COLMAP's lens and another sampler."""
+"""Undistorted photos: each pixel shows what its ray saw in the photo, checked by COLMAP's lens and another sampler."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""points.ply, read by the rules of PLY: every point with its colour, however far; and the field's points."""
+"""points.ply, read by the rules of PLY: every point with its colour, at any distance; and the field's points."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Poses of what carries the camera: written where the offset is known, and refused or said where it is not."""
+"""Poses of the camera's carrier: written if the offset is known, else refused or reported as unknown."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Writers: what goes out reads back equal, here and in COLMAP, and nothing of the caller's is lost."""
+"""Writers: their files read back equal, here and in COLMAP, and the caller's data is kept."""
 
 from __future__ import annotations
 

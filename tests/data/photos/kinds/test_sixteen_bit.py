@@ -1,4 +1,4 @@
-"""Grey photos of 16 bits: a set that uses a small part of them is shown by its own range, all photos alike."""
+"""Grey photos of 16 bits: a set with a narrow range is stretched to full contrast, all photos alike."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Videos of a camera that moves over a wall of texture, some of whose frames are blurred: what is filmed is known."""
+"""Videos of a camera that moves over a textured wall, with some blurred frames and known content."""
 
 from __future__ import annotations
 

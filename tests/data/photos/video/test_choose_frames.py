@@ -1,4 +1,4 @@
-"""The frames that are chosen are sharp, and spread over the camera's way."""
+"""The frames that are chosen are sharp, and spread over the camera's path."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A video is a set of photos: sharp frames of it, under names that tell the time."""
+"""A video becomes a set of photos: its sharp frames, named by time."""
 
 from __future__ import annotations
 

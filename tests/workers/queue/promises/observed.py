@@ -1,4 +1,4 @@
-"""The world as the database shows it, and what nobody may ever see in it."""
+"""The world as the database shows it, and the states that must never be visible in it."""
 
 from __future__ import annotations
 

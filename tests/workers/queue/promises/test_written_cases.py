@@ -1,4 +1,4 @@
-"""What chance seldom meets in few runs: late, repeated and simultaneous writes, and lost answers."""
+"""Cases that few random runs seldom reach: late, repeated and simultaneous writes, and lost answers."""
 
 from __future__ import annotations
 
