@@ -1,4 +1,4 @@
-"""The records of the engine: those of `biresnerf.wire` and, never sent to clients, where files are stored."""
+"""The engine's records: those of `biresnerf.wire`, plus the keys of stored files, which clients never get."""
 
 from __future__ import annotations
 

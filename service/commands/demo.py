@@ -1,6 +1,6 @@
 """`biresnerf demo`: a whole job over HTTP, from images with wrong poses to images with refined ones.
 
-Starts a service of its own, sends a scene whose true poses are known (or the user's), shows the progress,
+Starts a temporary service, sends a scene whose true poses are known (or the user's), shows the progress,
 fetches the results, measures them, and stops the service.
 """
 

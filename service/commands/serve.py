@@ -172,7 +172,7 @@ def migrate_command(as_json: bool) -> None:
 def demo_command(
     scene: Path | None, output: Path, preset: str, views: int, size: int, settings: dict[str, Any]
 ) -> None:
-    """Run a demonstration: a service of its own, wrong poses in, refined poses out.
+    """Run a demonstration on a temporary service: wrong poses in, refined poses out.
 
     Without --scene a synthetic scene with known poses is rendered and each camera is turned and shifted at random
     (14 degrees on average). All files are in OUTPUT afterwards.

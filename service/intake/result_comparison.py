@@ -44,7 +44,7 @@ async def compared(caller: Caller, first: ResultFiles, second: ResultFiles) -> C
 
 
 def compare(request: dict[str, Any]) -> dict[str, Any]:
-    """The comparison; None where a file is not what this version writes."""
+    """The comparison; None if a file is of another version or holds no poses."""
     from biresnerf.comparison.compare_results import compare_results
     from biresnerf.data.formats.simple.poses_json import PosesDocument
     from biresnerf.report import Report

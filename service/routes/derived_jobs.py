@@ -136,7 +136,7 @@ async def fork_job(
 async def export_job(job_id: JobId, caller: JobWriter, body: NewExport) -> Response:
     """Writes the result in additional formats; the files are then listed with those of the job.
 
-    The response is a job of its own, which can be followed and cancelled like any other. Repeating the request
+    The response is a separate job, which can be followed and cancelled like any other. Repeating the request
     returns the same export.
     """
     job, new = await _derived(caller).export(job_id, body.formats, body.poses_of)

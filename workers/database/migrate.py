@@ -23,7 +23,7 @@ MIGRATION_LOCK = 7_201_603
 def migrate(database_url: str, *, wait_s: float = 30.0) -> list[str]:
     """Apply what is missing and return the names of the steps applied (none: it was up to date).
 
-    Safe to call from many processes at once. Raises `SetupError` where the database does not answer within
+    Safe to call from many processes at once. Raises `SetupError` if the database does not answer within
     ``wait_s`` or was brought up by a newer version.
     """
     with _connect(database_url, wait_s) as connection:

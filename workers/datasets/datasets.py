@@ -48,7 +48,7 @@ FILE = "SELECT path, key, size, sha256, created_at FROM dataset_files"
 class DatasetStore(OwnedStore):
     """Datasets in the database and the file store. Get one from `workers.engine.open_stores`.
 
-    Every method raises `Unavailable` (``database_unavailable``) where the database does not answer.
+    Every method raises `Unavailable` (``database_unavailable``) if the database does not answer.
     """
 
     def __init__(self, database: Database, files: FileStore, settings: Settings) -> None:

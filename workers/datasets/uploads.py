@@ -52,7 +52,7 @@ _UPLOAD = "SELECT uploads.* FROM uploads JOIN datasets ON datasets.id = uploads.
 class UploadStore(OwnedStore):
     """Uploads in the database, their pieces in the file store. Get one from `workers.engine.open_stores`.
 
-    Every method raises `Unavailable` where database or store does not answer.
+    Every method raises `Unavailable` if database or store does not answer.
     """
 
     def __init__(self, database: Database, files: FileStore, settings: Settings) -> None:

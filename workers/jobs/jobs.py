@@ -52,7 +52,7 @@ from workers.webhooks.webhooks import add_webhook
 class JobStore(OwnedStore):
     """Jobs in the database. Get one from `workers.engine.open_stores`.
 
-    Every method raises `Unavailable` (``database_unavailable``) where the database does not answer.
+    Every method raises `Unavailable` (``database_unavailable``) if the database does not answer.
     """
 
     def __init__(self, database: Database, listener: JobListener, settings: Settings) -> None:
@@ -79,10 +79,9 @@ class JobStore(OwnedStore):
     ) -> tuple[JobView, bool]:
         """Queue a job at its tenant's turn; the job and its queue entry are written in one transaction.
 
-        ``request_digest`` stands for the dataset when requests are compared, where the client sent the
-        files themselves and the dataset was made for them (see `repeated`).
-        Returns the job and whether it is new (False: the same key with the same request came before).
-        Raises `NotFound` (dataset, job), `Conflict` (``dataset_not_ready``, ``idempotency_key_reused``,
+        ``request_digest`` replaces the dataset when requests are compared, if the client sent the files with the
+        request (see `repeated`). Returns the job and whether it is new (False: the same key with the same request came
+        before). Raises `NotFound` (dataset, job), `Conflict` (``dataset_not_ready``, ``idempotency_key_reused``,
         ``priority_not_allowed``, a code of `require_result`), `LimitReached` (``queue_full``, ``quota_exhausted``,
         ``daily_limit_reached``), `InputError` (``invalid_options``, ``webhook_url_refused``, ``address_refused``,
         ``deadline_refused``).

@@ -22,7 +22,7 @@ _LIVING = "result_links.expires_at > clock_timestamp()"
 class ResultLinkStore(OwnedStore):
     """Links in the database. Get one from `workers.engine.open_stores`.
 
-    Every method raises `Unavailable` (``database_unavailable``) where the database does not answer.
+    Every method raises `Unavailable` (``database_unavailable``) if the database does not answer.
     """
 
     async def create(self, job_id: str, valid_s: int) -> tuple[LinkView, str]:

@@ -48,7 +48,7 @@ class KeyRefused(Exception):
 class KeyStore:
     """Keys in the database. Get one from `workers.engine.open_stores`.
 
-    Every method raises `Unavailable` (``database_unavailable``) where the database does not answer.
+    Every method raises `Unavailable` (``database_unavailable``) if the database does not answer.
     """
 
     def __init__(self, database: Database) -> None:

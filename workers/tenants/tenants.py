@@ -28,7 +28,7 @@ TENANT_FORM = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
 class TenantStore:
     """Tenants in the database. Get one from `workers.engine.open_stores`.
 
-    Every method raises `Unavailable` (``database_unavailable``) where the database does not answer.
+    Every method raises `Unavailable` (``database_unavailable``) if the database does not answer.
     """
 
     def __init__(self, database: Database) -> None:

@@ -33,7 +33,7 @@ _DELIVERY = """
 class WebhookStore(OwnedStore):
     """Webhooks in the database. Get one from `workers.engine.open_stores`.
 
-    Every method raises `Unavailable` where the database does not answer.
+    Every method raises `Unavailable` if the database does not answer.
     """
 
     def __init__(self, database: Database, settings: Settings) -> None:
