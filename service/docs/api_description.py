@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from http import HTTPStatus
 from typing import Any
 
 from fastapi import APIRouter, FastAPI
@@ -12,7 +11,7 @@ from pydantic import BaseModel
 
 from service.docs.examples import example_of
 from service.http.access import REFUSALS
-from service.http.problems import MEDIA_TYPE, declared
+from service.http.problems import MEDIA_TYPE, declared, phrase
 
 _PROBLEM = {"$ref": "#/components/schemas/Problem"}
 
@@ -110,7 +109,7 @@ def _answers(responses: dict[str, Any], common: dict[int | str, dict[str, Any]])
             examples |= common[int(status)]["content"][MEDIA_TYPE]["examples"]
         if examples:
             complete[status] = {
-                "description": f"{HTTPStatus(int(status)).phrase}: `{'`, `'.join(examples)}`",
+                "description": f"{phrase(int(status))}: `{'`, `'.join(examples)}`",
                 "content": {MEDIA_TYPE: {"schema": _PROBLEM, "examples": examples}},
             }
     return complete

@@ -161,11 +161,19 @@ def declared(*codes: str) -> dict[int | str, dict[str, Any]]:
     return {
         status: {
             "model": Problem,
-            "description": f"{HTTPStatus(status).phrase}: `{'`, `'.join(names)}`",
+            "description": f"{phrase(status)}: `{'`, `'.join(names)}`",
             "content": {MEDIA_TYPE: {"examples": {name: _example(name) for name in names}}},
         }
         for status, names in sorted(by_status.items())
     }
+
+
+_PHRASES = {413: "Content Too Large", 416: "Range Not Satisfiable", 422: "Unprocessable Content"}
+
+
+def phrase(status: int) -> str:
+    """A status in RFC 9110's words; Python's own before 3.13 are older."""
+    return _PHRASES.get(status) or HTTPStatus(status).phrase
 
 
 def _example(code: str) -> dict[str, Any]:
