@@ -1,6 +1,6 @@
 """A drone's photos of a synthetic neighbourhood, with exact truth: for hundreds to thousands of photos.
 
-    python -m benchmarks.large.made_aerial OUT --photos 500 [--width 1000] [--poses]
+    python -m benchmarks.large.made_aerial OUT --photos 500 [--first 300] [--width 1000] [--poses]
     biresnerf refine OUT --output RESULT
     biresnerf evaluate RESULT OUT.truth.json
 
@@ -84,6 +84,7 @@ def main() -> None:
     )
     parser.add_argument("out", type=Path)
     parser.add_argument("--photos", type=int, default=500)
+    parser.add_argument("--first", type=int, help="Of the flight, only these.")
     parser.add_argument("--width", type=int, default=1000, help="px, of 4 to 3.")
     parser.add_argument("--metres", type=float, default=2.0, help="Standard deviation of GPS.")
     parser.add_argument(
@@ -97,7 +98,8 @@ def main() -> None:
     truth = poses_of(yaw, pitch, centres)
     off_yaw, off_pitch = rng.normal(0, asked.degrees, (2, asked.photos))
     said = poses_of(yaw + off_yaw, pitch + off_pitch, centres)
-    names = [f"images/DJI_{number + 1:05}.JPG" for number in range(asked.photos)]
+    taken = min(asked.photos, asked.first or asked.photos)
+    names = [f"images/DJI_{number + 1:05}.JPG" for number in range(taken)]
     begun, rendered = time.monotonic(), 0
     for number, name in enumerate(names):
         if not (path := asked.out / name).exists():
@@ -105,15 +107,15 @@ def main() -> None:
             write_photo(half, truth[number], said[number], number, asked.width, asked.seed, asked.metres)
             half.rename(path)
             rendered += 1
-            left = (time.monotonic() - begun) / rendered * (asked.photos - number - 1)
-            print(f"\r{number + 1} of {asked.photos}, {left / 60:.0f} min left ", end="", flush=True)
+            left = (time.monotonic() - begun) / rendered * (taken - number - 1)
+            print(f"\r{number + 1} of {taken}, {left / 60:.0f} min left ", end="", flush=True)
     asked.out.with_name(f"{asked.out.name}.truth.json").write_text(
-        transforms(truth, [f"{asked.out.name}/{name}" for name in names], asked.width)
+        transforms(truth[:taken], [f"{asked.out.name}/{name}" for name in names], asked.width)
     )
     if asked.poses:
         said[:, :3, 3] += rng.normal(0, asked.metres, (asked.photos, 3))
-        (asked.out / "transforms.json").write_text(transforms(said, names, asked.width))
-    print(f"\n{asked.out}: {asked.photos} photos")
+        (asked.out / "transforms.json").write_text(transforms(said[:taken], names, asked.width))
+    print(f"\n{asked.out}: {taken} photos")
 
 
 if __name__ == "__main__":
