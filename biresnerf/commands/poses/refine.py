@@ -115,5 +115,6 @@ def summary(report: Report, output: Path) -> str:
             )
     lines += [f"warning: {warning}" for warning in report.warnings]
     lines.append(f"time: {sum(report.seconds.values()):.0f} s; results in {output}")
-    lines.append(f"report: {output / REPORT_HTML}")
+    if (output / REPORT_HTML).is_file():
+        lines.append(f"report: {output / REPORT_HTML}")
     return "\n".join(lines)
