@@ -60,6 +60,13 @@ class CheckReport(Record):
     )
 
 
+class CheckProgress(Record):
+    """How far the check of a dataset is."""
+
+    photos_read: int = Field(examples=[12])
+    photos: int = Field(examples=[60], description="All that it will read, frames of videos included.")
+
+
 class DatasetLinks(Links):
     """Paths of the parts of a dataset."""
 
@@ -81,6 +88,11 @@ class DatasetView(Record):
     missing: tuple[str, ...] = Field((), description="Manifest paths not received yet.")
     report: CheckReport | None = Field(
         None, description="What the check found; null unless the dataset is ready."
+    )
+    checked: CheckProgress | None = Field(
+        None,
+        examples=[None],
+        description="How far the check is; null unless it runs and has found how many photos there are.",
     )
     error: JobError | None = Field(None, examples=[None])
     created_at: datetime

@@ -62,9 +62,10 @@ def browser() -> Iterator[Browser]:
 
 @pytest.fixture(scope="module")
 def service(browser: Browser, request: pytest.FixtureRequest) -> Iterator[Running]:
-    """`biresnerf up`, with the real job program or the module's own. Without a browser it is not started."""
-    own = request.node.get_closest_marker("jobs_by")
-    settings = {"job_command": (sys.executable, str(own.args[0]))} if own else {}
+    """`biresnerf up`, with real jobs and checks or the module's own programs. Without a browser it is not started."""
+    commands = {"job_command": "jobs_by", "check_command": "checks_by"}
+    own = {name: request.node.get_closest_marker(marker) for name, marker in commands.items()}
+    settings = {name: (sys.executable, str(mark.args[0])) for name, mark in own.items() if mark}
     with short_folder() as folder, running_service(folder, **settings) as running:
         yield running
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
 import uuid
 from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -80,13 +81,18 @@ class ClaimedWork(ABC):
 
 
 @contextlib.asynccontextmanager
-async def lease_renewed(renew: Callable[[], Awaitable[bool]], lease_s: float) -> AsyncIterator[None]:
-    """Renew a lease of ``lease_s`` while the context lasts, or until ``renew`` returns False: it is lost."""
+async def lease_renewed(
+    renew: Callable[[], Awaitable[bool]], lease_s: float, every_s: float = math.inf
+) -> AsyncIterator[None]:
+    """Renew a lease of ``lease_s`` while the context lasts, or until ``renew`` returns False: it is lost.
+
+    At least every ``every_s``, for callers whose ``renew`` also reports progress.
+    """
 
     async def keep() -> None:
         ours = True
         while ours:
-            await asyncio.sleep(lease_s / 4)
+            await asyncio.sleep(min(lease_s / 4, every_s))
             with contextlib.suppress(Unavailable):  # the next time will do
                 ours = await renew()
 

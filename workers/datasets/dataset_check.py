@@ -16,7 +16,7 @@ from pathlib import Path
 from psycopg.rows import DictRow
 from psycopg.types.json import Jsonb
 
-from biresnerf.wire.datasets import CheckReport
+from biresnerf.wire.datasets import CheckProgress, CheckReport
 from biresnerf.wire.problems import JobError
 from workers.database.claimed_work import lease_renewed
 from workers.database.database import Connection, Database, Statement
@@ -39,6 +39,7 @@ CHECK_NICE = 5  # a user waits for it: more urgent than a job
 EXIT_INPUT_ERROR = 2
 CHECKS = "checks"
 LOOK_S = 0.5  # poll interval while another process runs the check
+TELL_S = 1.0  # between two reports of progress, which users watch
 # Time limit of a check: per set, plus per file, plus by size.
 ANY_S, FILE_S, BYTES_PER_S = 120.0, 10.0, 100e3
 FATAL = JobError(
@@ -50,11 +51,12 @@ FATAL = JobError(
 
 @dataclass
 class Take:
-    """This process's claim on the check of a dataset, and how many photos it has read so far."""
+    """This process's claim on the check of a dataset, and how many photos, of how many, it has read so far."""
 
     dataset_id: str
     token: uuid.UUID = field(default_factory=uuid.uuid4)
     photos_read: int = 0
+    photos: int | None = None
 
 
 class Checker:
@@ -103,10 +105,10 @@ class Checker:
         rows = await self._database.fetch(
             "UPDATE datasets SET check_token = %s, check_until = clock_timestamp() + make_interval(secs => %s),"
             " check_losses = CASE WHEN check_photos < %s THEN 0 ELSE check_losses END,"
-            " check_photos = greatest(check_photos, %s)"
+            " check_photos = greatest(check_photos, %s), check_of = coalesce(%s, check_of)"
             " WHERE id = %s AND state = 'finalizing'"
             " AND (check_token = %s OR check_until IS NULL OR check_until < clock_timestamp()) RETURNING id",
-            *(take.token, 2 * self._settings.beat_s, take.photos_read, take.photos_read),
+            *(take.token, 2 * self._settings.beat_s, take.photos_read, take.photos_read, take.photos),
             *(take.dataset_id, take.token),
         )
         return bool(rows)
@@ -116,7 +118,7 @@ class Checker:
         rows = await self._rows("SELECT key, path FROM dataset_files WHERE dataset_id = %s", dataset_id)
         shown = shown_key(dataset_id)
         try:
-            async with lease_renewed(partial(self._take, take), 2 * self._settings.beat_s):
+            async with lease_renewed(partial(self._take, take), 2 * self._settings.beat_s, TELL_S):
                 # Until the outcome is recorded: this process may be killed, or the dataset deleted, before that.
                 await retry_while_unavailable(
                     lambda: self._database.run(discard, shown, after_s=self._settings.upload_expiry_s)
@@ -184,11 +186,11 @@ def _enough_s(dataset: Path) -> float:
     return ANY_S + FILE_S * len(sizes) + sum(sizes) / BYTES_PER_S
 
 
-def _photos_read(said: bytes) -> int:
-    """The photos read, by a line of the program; 0 if the line is about something else."""
+def _note_progress(take: Take, said: bytes) -> None:
+    """Note the progress that a line of the program reports; nothing if the line is about something else."""
     with contextlib.suppress(ValueError, TypeError, KeyError):
-        return int(json.loads(said)["photos_read"])
-    return 0
+        progress = CheckProgress.model_validate_json(said)
+        take.photos_read, take.photos = max(take.photos_read, progress.photos_read), progress.photos
 
 
 async def _run(
@@ -203,7 +205,7 @@ async def _run(
     try:
         async with asyncio.timeout(limit_s):
             async for output in child.lines():  # the last line is the answer
-                take.photos_read = max(take.photos_read, _photos_read(output))
+                _note_progress(take, output)
             status = await child.wait()
     except TimeoutError:
         detail = f"The check took longer than {limit_s:.4g} s."

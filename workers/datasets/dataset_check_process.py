@@ -1,9 +1,9 @@
 """The program that validates a dataset: `python -m workers.datasets.dataset_check_process FOLDER`.
 
-Writes lines of JSON to standard output: ``{"photos_read": n}`` after each photo, and at the end ``{"report": {...}}``
-(exit status 0) or ``{"error": a fault}`` (exit status 2). Writes what pages show of the set into a folder beside it.
-Exits with `EXIT_DISK` if the disk is full. It reads untrusted files, so it first limits its memory, CPU time and file
-sizes. Loads neither torch nor pycolmap; the job finds missing poses.
+Writes lines of JSON to standard output: ``{"photos_read": n, "photos": all}`` after each photo, and at the end
+``{"report": {...}}`` (exit status 0) or ``{"error": a fault}`` (exit status 2). Writes what pages show of the set into
+a folder beside it. Exits with `EXIT_DISK` if the disk is full. It reads untrusted files, so it first limits its memory,
+CPU time and file sizes. Loads neither torch nor pycolmap; the job finds missing poses.
 """
 
 from __future__ import annotations
@@ -36,7 +36,9 @@ def main(folder: Path) -> int:
 
     try:
         answer: dict[str, Any] = {
-            "report": check(folder, shown_folder(folder), lambda count: told(photos_read=count))
+            "report": check(
+                folder, shown_folder(folder), lambda count, all_: told(photos_read=count, photos=all_)
+            )
         }
         status = 0
     except MemoryError:
@@ -57,11 +59,11 @@ def main(folder: Path) -> int:
 
 
 def check(
-    folder: Path, shown: Path, on_photo: Callable[[int], object] = lambda _count: None
+    folder: Path, shown: Path, on_photo: Callable[[int, int], object] = lambda _count, _all: None
 ) -> dict[str, Any]:
     """Read ``folder`` and decode every image; returns the findings, and writes ``shown`` for pages.
 
-    Calls ``on_photo`` after each photo, with the number read so far.
+    Calls ``on_photo`` before the first photo and after each, with the number read so far and that of all.
 
     Raises:
         InputError: what is wrong, with which file, and a hint.
@@ -75,7 +77,10 @@ def check(
 
     sent = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
     dataset = read_dataset(folder, within=folder)
-    images = load_images(dataset, small_side(len(dataset)), on_photo=on_photo)
+    on_photo(0, len(dataset))
+    images = load_images(
+        dataset, small_side(len(dataset)), on_photo=lambda count: on_photo(count, len(dataset))
+    )
     question = pose_question(dataset)
     write_shown(dataset, images, folder, sent, shown, question.given_poses if question else ())
     posed = int(dataset.posed.sum())

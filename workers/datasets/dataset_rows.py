@@ -15,6 +15,8 @@ from workers.store.files import StoredFile
 
 DATASET = """
     SELECT datasets.*, coalesce(total.files, 0) AS files, coalesce(total.bytes, 0)::bigint AS bytes,
+        CASE WHEN state = 'finalizing' AND check_of IS NOT NULL
+            THEN jsonb_build_object('photos_read', check_photos, 'photos', check_of) END AS checked,
         ARRAY(SELECT entry ->> 'path'
             FROM jsonb_array_elements(datasets.manifest) WITH ORDINALITY AS listed(entry, place)
             WHERE NOT EXISTS (SELECT 1 FROM dataset_files AS file WHERE file.dataset_id = datasets.id

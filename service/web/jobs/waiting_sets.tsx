@@ -41,7 +41,7 @@ export function WaitingSets() {
 }
 
 function SetCard({ dataset, onDeleted }: { dataset: DatasetView; onDeleted: () => void }) {
-  const { id, name, state, report, files, created_at, expires_at } = dataset;
+  const { id, name, state, report, files, checked, created_at, expires_at } = dataset;
   const picture = useServed(state === "ready" ? `v1/datasets/${id}/thumbnail.jpg` : null);
   const { attempt, busy, problem } = useAttempt();
   const remove = () =>
@@ -58,6 +58,7 @@ function SetCard({ dataset, onDeleted }: { dataset: DatasetView; onDeleted: () =
         </a>
         <span>
           {report ? count(report.images, "photo") : count(files, "file")} · {WORDS[state]}
+          {checked && ` (${checked.photos_read} of ${count(checked.photos, "photo")} read)`}
         </span>
         <span class="soft job-foot">
           {moment(created_at)}

@@ -3,7 +3,7 @@ import type { ComponentChildren } from "preact";
 import type { DatasetView } from "schemas";
 import { count } from "../../../biresnerf/viewer/widgets/numbers";
 import { worded } from "../../../biresnerf/viewer/widgets/option_words";
-import { bytes } from "../parts/format";
+import { bytes, percent } from "../parts/format";
 
 type Mark = "good" | "note" | "bad" | "wait";
 const MARKS: Record<Mark, [string, string]> = {
@@ -24,7 +24,8 @@ const INTRINSICS: Record<string, string> = {
 /** What the report calls the format of photos without poses. */
 const ALONE = "images";
 const modelWords = (model: string) => model.toLowerCase().replaceAll("_", " ");
-const UNKNOWN = ["Images", "Poses", "Cameras", "Masks"];
+/** Known once all photos are read. */
+const LATER = ["Poses", "Cameras", "Masks"];
 
 export function CheckTable({ dataset }: { dataset: DatasetView }) {
   const { report } = dataset;
@@ -45,14 +46,37 @@ export function CheckTable({ dataset }: { dataset: DatasetView }) {
             {dataset.missing.length > 0 && `; ${dataset.missing.length} to come`}
           </Line>
           {report && <Found dataset={dataset} />}
-          {!report && !rejected && UNKNOWN.map((name) => (
-            <Line key={name} mark="wait" name={name}>
-              <span class="soft">not known yet</span>
-            </Line>
-          ))}
+          {!report && !rejected && (
+            <>
+              <Line mark="wait" name="Images">
+                <Read dataset={dataset} />
+              </Line>
+              {LATER.map((name) => (
+                <Line key={name} mark="wait" name={name}>
+                  <span class="soft">not known yet</span>
+                </Line>
+              ))}
+            </>
+          )}
         </tbody>
       </table>
     </section>
+  );
+}
+
+/** How many photos of how many the check has read. */
+function Read({ dataset: { state, checked } }: { dataset: DatasetView }) {
+  if (!checked) return <span class="soft">{state === "finalizing" ? "looking for photos and poses …" : "not known yet"}</span>;
+  const { photos_read, photos } = checked;
+  return (
+    <>
+      <p class="number">
+        {photos_read < photos ? `${photos_read} of ${count(photos, "photo")} read` : `${count(photos, "photo")} read; comparing them …`}
+      </p>
+      <progress max={photos} value={photos_read} aria-label="Photos read">
+        {percent(photos_read / photos)}
+      </progress>
+    </>
   );
 }
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from biresnerf.wire.datasets import DatasetView
+from biresnerf.wire.datasets import CheckProgress, DatasetView
 from tests.workers.conftest import ACCEPTED, SHORT_STALL, environment, quick_settings
 from tests.workers.datasets.test_datasets import chunks
 from workers.database.losses import LOSSES_MAX
@@ -92,6 +92,27 @@ async def test_a_check_that_found_the_disk_full_is_made_again(database_url: str,
             await stores.datasets.check(dataset)
         assert (await stores.datasets.get(dataset)).state == "finalizing"
         assert (await stores.datasets.check(dataset)).state == "ready"
+
+
+async def test_how_many_photos_a_check_has_read_is_known_while_it_runs(database_url: str, tmp_path):
+    go = tmp_path / "go"
+    said = """print('{"photos_read": 3, "photos": 7}', flush=True)"""
+    program = f"import pathlib, time; {said}\nwhile not pathlib.Path({str(go)!r}).exists(): time.sleep(0.05)"
+    beats = {"beat_s": 60.0, "stall_s": 600.0}  # long ones, as signs of life
+    settings = checked_by(f"{program}\n{ACCEPTED}", database_url, tmp_path, **beats)
+    async with open_stores(settings) as stores:
+        dataset = await finalized_dataset(stores)
+        assert (await stores.datasets.get(dataset)).checked is None
+        running = asyncio.create_task(stores.datasets.check(dataset))
+        async with asyncio.timeout(20):
+            while not (found := await stores.datasets.get(dataset)).checked:
+                await asyncio.sleep(0.1)
+        assert (found.state, found.checked) == ("finalizing", CheckProgress(photos_read=3, photos=7))
+        (listed,) = (await stores.datasets.list(limit=10)).items
+        assert listed.checked == found.checked
+        go.touch()
+        ready = await running
+        assert (ready.state, ready.checked) == ("ready", None)
 
 
 async def test_two_checks_at_once_run_the_program_once(database_url: str, tmp_path):
@@ -210,7 +231,7 @@ with open({marks!r}, "a+") as marks:
     marks.write("x")
 reads = {reads!r}
 if take < len(reads):
-    print(json.dumps({{"photos_read": reads[take]}}), flush=True)
+    print(json.dumps({{"photos_read": reads[take], "photos": 100}}), flush=True)
     time.sleep({beats_s})
     os.kill(os.getppid(), signal.SIGKILL)
 """

@@ -135,7 +135,7 @@ def test_the_check_names_the_broken_image(tmp_path: Path, scene: Path):
     good = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
     assert good.returncode == 0
     *reads, answer = map(json.loads, good.stdout.splitlines())
-    assert reads == [{"photos_read": count} for count in range(1, 7)]
+    assert reads == [{"photos_read": count, "photos": 6} for count in range(7)]
     assert answer["report"]["images"] == 6
     for number in range(2, 6):
         (folder / "train" / f"r_{number}.png").write_bytes(b"no image")

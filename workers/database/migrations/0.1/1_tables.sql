@@ -49,7 +49,8 @@ CREATE TABLE api_keys (
 );
 
 -- `check_token`, `check_until`: who checks the dataset, and until when without a sign of life. `check_losses`: how many
--- processes in a row were lost while they read it and got no further; `check_photos`: by how many photos one got furthest.
+-- processes in a row were lost while they read it and got no further; `check_photos`: by how many photos one got furthest,
+-- of `check_of`.
 -- `expires_at` is kept up to date by the dispatcher, which alone deletes by it; null is never.
 CREATE TABLE datasets (
     id text PRIMARY KEY,
@@ -65,6 +66,7 @@ CREATE TABLE datasets (
     check_until timestamptz,
     check_losses int NOT NULL DEFAULT 0,
     check_photos int NOT NULL DEFAULT 0,
+    check_of int,
     created_at timestamptz NOT NULL DEFAULT clock_timestamp(),
     touched_at timestamptz NOT NULL DEFAULT clock_timestamp(),
     expires_at timestamptz,
