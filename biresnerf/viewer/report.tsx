@@ -4,7 +4,7 @@ import { useCallback, useMemo } from "preact/hooks";
 import type { PosesDocument, Report, ViewFile } from "schemas";
 import { historyOf, pointsOf } from "./result/widget_data";
 import { ResultView } from "./result_view";
-import { count, duration, fixed } from "./widgets/numbers";
+import { count, duration, fixed, largest, pixels } from "./widgets/numbers";
 import { optionText, optionTitle, worded } from "./widgets/option_words";
 
 /** What report_html.py embeds. */
@@ -73,13 +73,23 @@ function factsOf(report: Report): string[] {
   return [
     count(report.images.length, "image"),
     `${report.options.preset}, ${report.options.method}`,
-    count(report.steps_done, "step"),
-    `${report.working_size[0]} × ${report.working_size[1]} px`,
+    report.state === "partial"
+      ? `stopped after ${report.steps_done.toLocaleString("en-GB")} of ${count(Number(report.options.steps), "step")}`
+      : count(report.steps_done, "step"),
+    sizeWords(report),
     ...(report.heldout?.unshared_opacity != null
       ? [`${fixed(100 * report.heldout.unshared_opacity, 1)} % of what is rendered lies where no second camera looks`]
       : []),
     `${duration(seconds)} on ${report.device}`,
   ];
+}
+
+/** The photos' own size, and at which the field saw them. */
+function sizeWords({ cameras, working_size: [width, height] }: Report): string {
+  const seen = `${width} × ${height} px`;
+  const own = largest(cameras);
+  if (!own) return `copies of ${seen} to learn from`;
+  return own.width > width ? `photos of ${pixels(own)}, learned from copies of ${seen}` : `photos of ${pixels(own)}`;
 }
 
 function Notes({ title, lines }: { title: string; lines: readonly string[] }) {

@@ -28,6 +28,7 @@ BUNDLE = Path(__file__).parent / "dist"
 MOST_BYTES = 8_000_000
 MOST_VIDEO_BYTES = 2_000_000
 PICTURE_PX, QUALITY = 640, 82  # long side and JPEG quality of an embedded picture
+_POSES = {"complete": "Refined poses", "partial": "Poses so far"}
 _MEDIA = {".jpg": "image/jpeg", ".bin": "application/octet-stream"}
 NOT_BUILT = (
     "report.html was not written: its viewer is not built. Run `make web`, then `biresnerf report OUT`."
@@ -54,7 +55,7 @@ def write_report_html(folder: Path, report: Report, title: str | None = None) ->
         return (NOT_BUILT,)
     view = read_view_file(folder) if (folder / VIEW).is_file() else None
     files, left_out = _embedded(folder, view)
-    title = title or f"Refined poses of {len(report.images)} images"
+    title = title or f"{_POSES[report.state]} of {len(report.images)} images"
     history = folder / HISTORY
     data = {
         "title": title,

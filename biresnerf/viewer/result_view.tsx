@@ -23,6 +23,7 @@ export function ResultView({ poses, report, view, points, history, urlOf }: Prop
   const { names, cameras, centres, rows, cellOf, photoOf } = useWidgetData(poses, report, view, urlOf);
   const [selected, setSelected] = useState<number | null>(view?.views[0]?.image ?? (names.length > 0 ? 0 : null));
   const choice = { selected, onSelect: setSelected };
+  const stopped = report.state === "partial";
   return (
     <div class="job-view">
       <div class="panel">
@@ -30,8 +31,8 @@ export function ResultView({ poses, report, view, points, history, urlOf }: Prop
       </div>
       <div class="job-pictures compared">
         <div class="panel panel-compare">
-          <h2>Result</h2>
-          <ImageCompare names={names} views={view?.views ?? []} centres={centres} urlOf={urlOf} {...choice} />
+          <h2>{stopped ? "Result so far" : "Result"}</h2>
+          <ImageCompare {...{ names, centres, urlOf, stopped }} views={view?.views ?? []} {...choice} />
         </div>
         <div class="panel panel-scene">
           <h2>Cameras</h2>
@@ -50,7 +51,7 @@ export function ResultView({ poses, report, view, points, history, urlOf }: Prop
       </div>
       <div class="panel">
         <h2>Progress of the run</h2>
-        <Curves lines={history} switchStep={report.switch_step} switchReason={report.switch_reason} steps={report.steps_done} />
+        <Curves lines={history} switchStep={report.switch_step} switchReason={report.switch_reason} steps={report.steps_done} ended={stopped ? "stopped" : "complete"} />
       </div>
     </div>
   );

@@ -199,29 +199,49 @@ def _amount_and_unit(seconds: float) -> tuple[str, str]:
     return (f"{minutes:.0f}", "min") if minutes < 90 else (f"{minutes / 60:.1f}", "h")
 
 
+def _posed(posed: int, without: list[str]) -> str:
+    """How many photos have a pose, and a few that have none."""
+    from biresnerf.data.photos.photo_folders import few_names
+
+    if not without:
+        return f"{posed} with a pose"
+    return (
+        f"{posed} with a pose, {len(without)} without: {few_names(without, 3)}"
+        if posed
+        else "none with a pose"
+    )
+
+
+def _learned_from(found: dict[str, Any]) -> str:
+    """At what size the field sees the photos, beside their own."""
+    own = max((camera["width"], camera["height"]) for camera in found["cameras"])
+    width, height = found["plan"]["working_size"]
+    memory = f"{found['plan']['photo_bytes'] / 2**20:.0f} MiB in memory"
+    if (width, height) == own:
+        return f"learn from the photos at their own size ({memory})"
+    return (
+        f"learn from copies shrunk to {width} x {height} px ({memory}); photos and results keep the full size"
+    )
+
+
 def _lines(found: dict[str, Any]) -> list[str]:
     lines = [f"{found['folder']}: {found['images']} images, {found['format']}"]
     lines += [f"  poses from {file}" for file in found["pose_files"][:5]]
-    without = found["without_pose"]
-    lines.append(f"  {found['with_pose']} with a pose" + (f", {len(without)} without" if without else ""))
-    lines += [f"    no pose: {name}" for name in without[:10]]
-    if len(without) > 10:
-        lines.append(f"    and {len(without) - 10} more")
+    lines.append(f"  {_posed(found['with_pose'], found['without_pose'])}")
     for camera in found["cameras"]:
         size = f"{camera['width']} x {camera['height']} px"
         lines.append(
-            f"  {camera['images']} images by {camera['model']}, {size}, intrinsics {camera['intrinsics']}"
+            f"  {camera['images']} images of {size} by {camera['model']}, intrinsics {camera['intrinsics']}"
         )
     if found["masks"]:
         lines.append(f"  {found['masks']} masks")
     wanted = found["plan"]
-    width, height = wanted["working_size"]
     lines += [
         f"refine --preset {wanted['preset']} would",
         f"  start from: {wanted['start']}",
         *([f"  cut panoramas: {wanted['views']} views"] if wanted["views"] > found["images"] else []),
-        f"  take {wanted['steps']} steps on photos of up to {width} x {height} px"
-        f" ({wanted['photo_bytes'] / 2**20:.0f} MiB of pixels)",
+        f"  take {wanted['steps']} steps",
+        f"  {_learned_from(found)}",
     ]
     if wanted["seconds"]:
         times = (f"{in_minutes(*between)} ({preset})" for preset, between in wanted["seconds"].items())

@@ -1,4 +1,4 @@
-// Curves of the run: fit to the photos, motion of the cameras, and the signal of the stability detector.
+// Curves of the run: fit to the photos, motion of the cameras, and what decides when stage 2 begins.
 import { useEffect, useMemo, useRef } from "preact/hooks";
 import type uPlot from "uplot";
 import type { CurvePoint } from "../result/widget_data";
@@ -13,6 +13,8 @@ interface CurvesProps {
   readonly switchReason?: "stable" | "cap" | null;
   /** Total steps of the run, if known: the axis then includes the steps to come. */
   readonly steps?: number | null;
+  /** How the run ended; null while it goes on. */
+  readonly ended?: "complete" | "stopped" | null;
 }
 
 const HEIGHT_PX = 170;
@@ -35,6 +37,8 @@ interface Chart {
   /** Whether a line belongs to this chart, and the note until its curve begins. */
   readonly of?: (line: CurvePoint) => boolean;
   readonly later?: string;
+  /** What it measures and decides, where the title cannot say it. */
+  readonly note?: string;
 }
 
 const CHARTS: readonly Chart[] = [
@@ -58,19 +62,22 @@ const CHARTS: readonly Chart[] = [
     summary: (lines) => ends(lines, "Turning between checks", (line) => `${short(line.moved_deg)} degrees`),
   },
   {
-    title: "Stability signal",
-    axis: "dB, later half of the steps",
+    title: "What stage 1 still gains",
+    axis: "dB",
     of: (line) => line.stage === "coarse",
-    later: "begins at the detector's sixth check",
+    later: "begins at the sixth check",
+    note:
+      "How much better the photos fit than halfway through the steps so far. Stage 2 begins once this stays between the dashed " +
+      "lines, or after the longest stage 1 allowed.",
     curves: [
-      { label: "trend of the error, dB", colour: "--curve-1", value: (line) => line.trend_db },
-      { label: "level within ±", colour: "--curve-3", value: (line) => line.level_db, dashed: true },
+      { label: "gain, dB", colour: "--curve-1", value: (line) => line.trend_db },
+      { label: "little against all that was gained, ± dB", colour: "--curve-3", value: (line) => line.level_db, dashed: true },
       { label: "", colour: "--curve-3", value: (line) => negative(line.level_db), dashed: true },
     ],
     summary: (lines) =>
       ends(
         lines.filter((line) => line.trend_db != null),
-        "Trend of the error over the later half of the steps, in stage 1",
+        "Gain over the later half of the steps, in stage 1",
         (line) => `${fixed(line.trend_db, 2)} dB`,
       ),
   },
@@ -85,11 +92,11 @@ function ends(lines: readonly CurvePoint[], what: string, say: (line: CurvePoint
   return `${what}: ${say(first)} at step ${first.step}, ${say(last)} at step ${last.step}`;
 }
 
-export function Curves({ lines, switchStep = null, switchReason = null, steps = null }: CurvesProps) {
+export function Curves({ lines, switchStep = null, switchReason = null, steps = null, ended = null }: CurvesProps) {
   if (lines.length === 0) {
     return (
       <section class="curves" aria-label="Curves of the run">
-        <p class="notice">The curves begin at the first check of the stability detector.</p>
+        <p class="notice">The curves begin at the run's first check of its progress.</p>
       </section>
     );
   }
@@ -99,7 +106,7 @@ export function Curves({ lines, switchStep = null, switchReason = null, steps = 
     <section class="curves" aria-label="Curves of the run">
       <div class="curves-charts">
         {shown.map((chart) => (
-          <Plot key={chart.title} chart={chart} lines={lines} switchStep={began} steps={steps} />
+          <Plot key={chart.title} chart={chart} lines={lines} switchStep={began} steps={steps} over={ended !== null} />
         ))}
       </div>
       <p class="curves-stages soft">
@@ -107,16 +114,22 @@ export function Curves({ lines, switchStep = null, switchReason = null, steps = 
         {began !== null && began > 0 ? (
           <>
             <i class="stage-2" /> stage 2, high resolution: detail, from step {began}
-            {switchReason === "stable" && " (the error was stable)"}
+            {switchReason === "stable" && " (the fit had settled)"}
             {switchReason === "cap" && " (at the step limit)"}
           </>
         ) : (
-          "(stage 2 has not begun)"
+          NO_STAGE_2[ended ?? "running"]
         )}
       </p>
     </section>
   );
 }
+
+const NO_STAGE_2 = {
+  running: "(stage 2 has not begun)",
+  stopped: "(the run was stopped before stage 2)",
+  complete: "(the run had no stage 2)",
+} as const;
 
 /** The last step of stage 1, once stage 2 has begun. */
 function switchOf(lines: readonly CurvePoint[]): number | null {
@@ -124,8 +137,8 @@ function switchOf(lines: readonly CurvePoint[]): number | null {
   return first < 0 ? null : first === 0 ? 0 : (lines[first - 1]?.step ?? null);
 }
 
-function Plot(props: { chart: Chart; lines: readonly CurvePoint[]; switchStep: number | null; steps: number | null }) {
-  const { chart, lines, switchStep, steps } = props;
+function Plot(props: { chart: Chart; lines: readonly CurvePoint[]; switchStep: number | null; steps: number | null; over: boolean }) {
+  const { chart, lines, switchStep, steps, over } = props;
   const dark = useDark();
   const host = useRef<HTMLDivElement>(null);
   const plot = useRef<uPlot | null>(null);
@@ -160,9 +173,10 @@ function Plot(props: { chart: Chart; lines: readonly CurvePoint[]; switchStep: n
               <i class={curve.dashed ? "dash dash-dashed" : "dash"} style={{ color: `var(${curve.colour})` }} /> {curve.label}
             </span>
           ))}
-        {chart.later && !lines.some((line) => line.trend_db != null) && <span class="soft">({chart.later})</span>}
+        {chart.later && !lines.some((line) => line.trend_db != null) && <span class="soft">({over ? "stage 1 ended before that was known" : chart.later})</span>}
       </figcaption>
       <div ref={host} role="img" aria-label={`${chart.title}. ${chart.summary(lines)}.`} />
+      {chart.note && <p class="curve-note soft">{chart.note}</p>}
     </figure>
   );
 }

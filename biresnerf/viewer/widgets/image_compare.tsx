@@ -12,6 +12,8 @@ interface ImageCompareProps {
   /** Centres of the cameras, to find the nearest rendered views. */
   readonly centres: readonly Triple[];
   readonly urlOf: UrlOf;
+  /** Whether the run was stopped before its end, where views are rendered. */
+  readonly stopped?: boolean;
   readonly selected: number | null;
   readonly onSelect: (image: number | null) => void;
 }
@@ -31,7 +33,7 @@ const WORDS = { photo: "Photo", render: "Render of", before: "Render with the gi
 const TAGS = { photo: "photo", render: "render", before: "given poses", after: "refined poses" };
 const NEAR = 3;
 
-export function ImageCompare({ names, views, centres, urlOf, selected, onSelect }: ImageCompareProps) {
+export function ImageCompare({ names, views, centres, urlOf, stopped = false, selected, onSelect }: ImageCompareProps) {
   const [chosen, setMode] = useState<Mode>("swipe");
   const view = views.find((one) => one.image === selected);
   const modes = view?.pictures.before ? MODES : MODES.filter(({ value }) => value !== "refined");
@@ -40,7 +42,7 @@ export function ImageCompare({ names, views, centres, urlOf, selected, onSelect 
   if (views.length === 0) {
     return (
       <section class="compare" aria-label="Render against photo">
-        <p class="notice">No view of this result was rendered.</p>
+        <p class="notice">{stopped ? "Views are rendered at the end of a run. This one was stopped before." : "No view of this result was rendered."}</p>
       </section>
     );
   }

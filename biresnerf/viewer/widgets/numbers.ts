@@ -30,6 +30,15 @@ export function median(values: readonly number[]): number | null {
 export const count = (value: number, one: string, many = `${one}s`): string =>
   `${value.toLocaleString("en-GB")} ${value === 1 ? one : many}`;
 
+interface Size {
+  readonly width: number;
+  readonly height: number;
+}
+
+export const largest = (sizes: readonly Size[]): Size | undefined => [...sizes].sort((a, b) => b.width * b.height - a.width * a.height)[0];
+
+export const pixels = ({ width, height }: Size): string => `${width} × ${height} px`;
+
 export function duration(seconds: number): string {
   const whole = Math.round(seconds);
   if (whole < 60) return `${whole} s`;

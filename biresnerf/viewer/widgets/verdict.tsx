@@ -3,7 +3,8 @@ import type { PairedDifference, Report, Verdict } from "schemas";
 import { VerdictChip } from "./controls";
 import { count, fixed, short, signed } from "./numbers";
 
-export function VerdictSentence({ report: { verdict, verdict_so_far, state, options } }: { report: Report }) {
+export function VerdictSentence({ report }: { report: Report }) {
+  const { verdict, state, options } = report;
   return (
     <p class="verdict-sentence">
       {verdict ? (
@@ -12,9 +13,9 @@ export function VerdictSentence({ report: { verdict, verdict_so_far, state, opti
         </>
       ) : (
         <>
-          <span class="chip chip-plain">{state === "partial" ? "partial" : "no verdict"}</span>
+          <span class="chip chip-plain">{state === "partial" ? "partial result" : "no verdict"}</span>
           {state === "partial"
-            ? `The run was stopped early. ${soFarWords(verdict_so_far)}`
+            ? stoppedWords(report)
             : options.verdict === false
               ? "No verdict was requested: the result holds the refined poses."
               : "No verdict was reached."}
@@ -32,11 +33,28 @@ function returnedWords({ returned, compared_with }: Verdict): string {
   return `The downloads contain ${WHOSE[compared_with]}; the refined ones are in refined/.`;
 }
 
-/** The same of a run that has no verdict yet. */
+/** Where a run was stopped, and what that means for its poses and the verdict. */
+function stoppedWords({ steps_done, options, verdict_so_far }: Report): string {
+  return [
+    `The run was stopped ${stepWords(steps_done, Number(options.steps))}.`,
+    soFarWords(verdict_so_far),
+    "There is no verdict: the test on photos that were held back comes at the end of a run.",
+    verdict_so_far?.why[0],
+  ]
+    .filter(Boolean)
+    .join(" ");
+}
+
+function stepWords(done: number, all: number): string {
+  if (done === 0) return "before its first step";
+  return done < all ? `at step ${done.toLocaleString("en-GB")} of ${all.toLocaleString("en-GB")}` : "after its last step, before its end";
+}
+
+/** Which poses are in the downloads of a stopped run. */
 function soFarWords(verdict: Verdict | null): string {
-  if (!verdict) return "The downloads contain its latest poses, which were not compared with the input's.";
-  const whose = verdict.returned === "input" ? `${WHOSE[verdict.compared_with]}: no better ones were found until then` : "the best poses so far";
-  return `The downloads contain ${whose}. ${verdict.why[0]}`;
+  if (!verdict) return "The downloads contain its latest poses. They are not final, and were not compared with the input's.";
+  if (verdict.returned === "input") return `The downloads contain ${WHOSE[verdict.compared_with]}: no better ones were found until then.`;
+  return "The downloads contain the best poses until then, which are not final.";
 }
 
 /** The two measurements behind a verdict, folded away. */

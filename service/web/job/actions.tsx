@@ -1,11 +1,12 @@
 // What can be done with a job: cancel it, run it again with other options, delete it, copy its link.
 import { useEffect, useState } from "preact/hooks";
-import type { JobView } from "schemas";
-import { requestJson, shared } from "../api/http";
+import type { CheckReport, DatasetView, JobView } from "schemas";
+import { once, useLoaded } from "../api/hooks";
+import { type Problem, requestJson, shared } from "../api/http";
 import { Store, useStore } from "../api/store";
 import { isOver } from "../jobs/state";
 import { OptionsForm } from "../options/form";
-import type { Values } from "../options/schema";
+import { changesTimes, type Values } from "../options/schema";
 import { CopyButton } from "../parts/copy_button";
 import { DialogButton } from "../parts/dialog_button";
 import { Share } from "./share";
@@ -90,24 +91,43 @@ function RunAgain({ job }: { job: JobView }) {
       ]}
       dismiss="Close"
     >
-      {(problem) => (
-        <>
-          <OptionsForm
-            values={values}
-            onChange={setValues}
-            preset={presetOf(job)}
-            base={job.resolved_options ?? job.options}
-            problems={problem?.errors ?? []}
-            withPresets
-          />
-          <p class="soft">
-            Continuing saves time: it reuses COLMAP's result, or the poses of the first stage as well, as far as the changed
-            options allow. If they allow neither, you are told why.
-          </p>
-        </>
-      )}
+      {(problem) => <OtherOptions {...{ job, values, problem }} onChange={setValues} />}
     </DialogButton>
   );
+}
+
+interface OtherProps {
+  job: JobView;
+  values: Values;
+  onChange: (change: (values: Values) => Values) => void;
+  problem: Problem | null;
+}
+
+function OtherOptions({ job, values, onChange, problem }: OtherProps) {
+  const { value: dataset } = useLoaded((signal) => requestJson<DatasetView>("GET", `v1/datasets/${job.dataset_id}`, { signal }), once, [job.dataset_id]);
+  const times = timesOf(job, values, dataset?.report?.expected_s ?? {});
+  return (
+    <>
+      <OptionsForm
+        {...{ values, onChange, times }}
+        preset={presetOf(job)}
+        base={job.resolved_options ?? job.options}
+        problems={problem?.errors ?? []}
+      />
+      <p class="soft">
+        {Object.keys(times).length > 0 && "Times are of runs from the start. "}
+        Continuing saves time: it reuses COLMAP's result, or the poses of the first stage as well, as far as the changed
+        options allow. If they allow neither, you are told why.
+      </p>
+    </>
+  );
+}
+
+/** Seconds of a run from the start with each preset. The job's own one may have other steps or sizes than usual. */
+function timesOf(job: JobView, values: Values, expected: CheckReport["expected_s"]): CheckReport["expected_s"] {
+  if (changesTimes(values)) return {};
+  const own = values.preset === undefined && changesTimes(job.options) ? presetOf(job) : null;
+  return Object.fromEntries(Object.entries(expected).filter(([preset]) => preset !== own));
 }
 
 /** Null where the job names none and no worker has chosen one yet. */

@@ -47,7 +47,7 @@ export function Failure({ job, images }: { job: JobView; images: readonly string
 
 const WITHOUT_RESULT: Record<string, { title: string; words: string }> = {
   expired: { title: "Its files have expired", words: "The images may still be there: run the job again." },
-  cancelled: { title: "Cancelled", words: "Only its log was kept. Run it again, or continue from its work." },
+  cancelled: { title: "Cancelled", words: "The run was stopped on request. Its poses were not kept, so there is no result and no verdict: only its log. Run it again, or continue from its work." },
 };
 export const HEADINGS: Record<string, string> = {
   timeout: "The job took longer than the service allows",

@@ -194,7 +194,7 @@ function lineOf(job: JobView, last: CurvePoint | undefined): CurvePoint | null {
   const stage = stepping(job);
   if (!stage || loss === undefined || psnr === undefined || !last || step <= last.step) return null;
   const line = { step, stage, loss, psnr, moved_deg: moved_deg ?? 0 };
-  // The stability detector runs in stage 1 only; the job keeps its last values.
+  // What decides when stage 2 begins is known in stage 1 only; the job keeps its last values.
   const signal = stage === "coarse" ? SIGNAL.filter((name) => job.metrics[name] !== undefined) : [];
   return { ...line, ...Object.fromEntries(signal.map((name) => [name, job.metrics[name]])) };
 }

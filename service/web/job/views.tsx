@@ -20,6 +20,7 @@ export function JobViews({ seen, urlOf }: { seen: LiveState; urlOf: UrlOf }) {
   const job = seen.job!;
   const guest = useStore(shared);
   const over = isOver(job);
+  const stopped = over && job.state !== "succeeded";
   const { value: widgets, problem } = useLoaded(() => import("./widgets"), once, []);
   const [chosen, setChosen] = useState<number | null | undefined>(undefined);
   const first = view?.views[0]?.image ?? (poses?.images.length ? 0 : null);
@@ -40,9 +41,9 @@ export function JobViews({ seen, urlOf }: { seen: LiveState; urlOf: UrlOf }) {
     </Panel>
   );
   const pictures = (
-    <Panel key="pictures" name={view ? "Result" : job.stage === "seeding" ? "Feature matches" : "Preview"} kind="panel-compare">
+    <Panel key="pictures" name={view ? (stopped ? "Result so far" : "Result") : job.stage === "seeding" ? "Feature matches" : "Preview"} kind="panel-compare">
       {widgets && view ? (
-        <widgets.ImageCompare {...{ names, centres, urlOf, ...choice }} views={view.views} />
+        <widgets.ImageCompare {...{ names, centres, urlOf, stopped, ...choice }} views={view.views} />
       ) : (
         <Preview seen={seen} poses={poses} urlOf={urlOf} waiting={waiting} />
       )}
@@ -65,6 +66,7 @@ export function JobViews({ seen, urlOf }: { seen: LiveState; urlOf: UrlOf }) {
             switchStep={report?.switch_step ?? null}
             switchReason={report?.switch_reason ?? null}
             steps={over ? (report?.steps_done ?? null) : job.progress.steps_total || null}
+            ended={over ? (stopped ? "stopped" : "complete") : null}
           />
         ) : (
           <Placeholder job={job} for="curves" />

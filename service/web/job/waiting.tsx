@@ -4,6 +4,7 @@ import { count, roughlyBetween } from "../../../biresnerf/viewer/widgets/numbers
 import { Thumb } from "../../../biresnerf/viewer/widgets/thumb";
 import { once, useLoaded } from "../api/hooks";
 import { requestJson } from "../api/http";
+import { changesTimes } from "../options/schema";
 import { GivenCameras } from "../parts/given_cameras";
 import type { SetPhotos } from "../upload/set_photos";
 
@@ -24,9 +25,8 @@ export function WaitingCameras({ photos, words }: { photos: SetPhotos | null; wo
 export function WaitingPhotos({ job, photos: { list, cellOf } }: { job: JobView; photos: SetPhotos }) {
   const { value: dataset } = useLoaded((signal) => requestJson<DatasetView>("GET", `v1/datasets/${job.dataset_id}`, { signal }), once, [job.dataset_id]);
   const report = dataset?.report;
-  const { steps, time_budget_s, max_image_size } = job.options;
   const preset = String(job.options.preset ?? report?.preset ?? "");
-  const seconds = steps || time_budget_s || max_image_size ? undefined : report?.expected_s[preset as keyof typeof report.expected_s];
+  const seconds = changesTimes(job.options) ? undefined : report?.expected_s[preset as keyof typeof report.expected_s];
   return (
     <>
       <p class="soft">

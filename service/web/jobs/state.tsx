@@ -52,12 +52,20 @@ export function Chip({ job }: { job: JobView }) {
   return <span class={`chip chip-${tone}`}>{job.partial ? "partial result" : words}</span>;
 }
 
+/** Where in its run a job was stopped, as far as it had begun. */
+function whereWords({ stage, progress: { step, steps_total } }: JobView): string {
+  if (!stage) return "";
+  if (stage !== "coarse" && stage !== "fine") return ` while ${NOW[stage].toLowerCase()}`;
+  return ` at step ${step} of ${steps_total}`;
+}
+
 /** What it does now, the step and the time left, in one line. */
 function progressWords(job: JobView): string {
   if (job.state === "queued") return job.queue_position ? `Number ${job.queue_position} in the queue` : "Waiting";
   if (job.state !== "running") {
     const took = job.started_at && job.finished_at && Date.parse(job.finished_at) - Date.parse(job.started_at);
-    return took ? `${STATE_WORDS[job.state]} after ${duration(took / 1000)}` : STATE_WORDS[job.state];
+    const words = `${STATE_WORDS[job.state]}${job.state === "cancelled" ? whereWords(job) : ""}`;
+    return took ? `${words}, after ${duration(took / 1000)}` : words;
   }
   const { step, steps_total } = job.progress;
   const parts = [job.stage ? NOW[job.stage] : "Starting"];

@@ -31,8 +31,8 @@ interface Props {
   /** Values of the fields that are left empty; without it, those of the preset. */
   base?: Values;
   problems?: readonly FieldProblem[];
-  /** Shows the presets, too. */
-  withPresets?: boolean;
+  /** Shows the presets, too, with the times that are known of jobs with them. */
+  times?: CheckReport["expected_s"];
 }
 
 let loaded: Promise<OptionsView> | null = null;
@@ -69,7 +69,7 @@ export function Presets({ preset, onChange, expected = {} }: PresetProps) {
   );
 }
 
-export function OptionsForm({ values, onChange, preset: usual, base, problems = [], withPresets = false }: Props) {
+export function OptionsForm({ values, onChange, preset: usual, base, problems = [], times }: Props) {
   const { value: view, problem } = useLoaded(loadOptions, once, []);
   const fields = useMemo(() => view && fieldsOf(view.json_schema), [view]);
   if (problem) return <ProblemBox problem={problem} />;
@@ -93,7 +93,7 @@ export function OptionsForm({ values, onChange, preset: usual, base, problems = 
   const changed = [...fields.usual, ...fields.expert, ...fields.research].filter(({ name }) => name in values).length;
   return (
     <div class="options">
-      {withPresets && <Presets preset={preset} onChange={(name) => set("preset", name)} />}
+      {times && <Presets preset={preset} expected={times} onChange={(name) => set("preset", name)} />}
       <div class="fields">{fields.main.map(row)}</div>
       <details>
         <summary>

@@ -25,6 +25,10 @@ const ZERO = /[;,.] 0: ([^.;]+)/;
 
 export type Values = Record<string, unknown>;
 
+/** Whether these options make a job longer or shorter than its preset does, so that no time of it is known. */
+export const changesTimes = (values: Values): boolean =>
+  ["steps", "time_budget_s", "max_image_size", "samples_per_step"].some((name) => values[name] != null);
+
 export interface Field {
   name: string;
   title: string;

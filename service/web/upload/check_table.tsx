@@ -1,7 +1,7 @@
 // The result of the service's check of an image set, as far as it is known.
 import type { ComponentChildren } from "preact";
-import type { DatasetView } from "schemas";
-import { count } from "../../../biresnerf/viewer/widgets/numbers";
+import type { CheckedCamera, CheckReport, DatasetView } from "schemas";
+import { count, largest, pixels } from "../../../biresnerf/viewer/widgets/numbers";
 import { worded } from "../../../biresnerf/viewer/widgets/option_words";
 import { bytes, percent } from "../parts/format";
 
@@ -27,7 +27,13 @@ const modelWords = (model: string) => model.toLowerCase().replaceAll("_", " ");
 /** Known once all photos are read. */
 const LATER = ["Poses", "Cameras", "Masks"];
 
-export function CheckTable({ dataset }: { dataset: DatasetView }) {
+interface Props {
+  dataset: DatasetView;
+  /** Once they are known. */
+  cameras?: readonly CheckedCamera[];
+}
+
+export function CheckTable({ dataset, cameras = [] }: Props) {
   const { report } = dataset;
   const checking = dataset.state === "finalizing";
   const rejected = dataset.state === "rejected";
@@ -45,7 +51,7 @@ export function CheckTable({ dataset }: { dataset: DatasetView }) {
             {count(dataset.files, "file")}, {bytes(dataset.bytes)}
             {dataset.missing.length > 0 && `; ${dataset.missing.length} to come`}
           </Line>
-          {report && <Found dataset={dataset} />}
+          {report && <Found {...{ report, cameras }} />}
           {!report && !rejected && (
             <>
               <Line mark="wait" name="Images">
@@ -80,13 +86,14 @@ function Read({ dataset: { state, checked } }: { dataset: DatasetView }) {
   );
 }
 
-function Found({ dataset }: { dataset: DatasetView }) {
-  const report = dataset.report!;
+function Found({ report, cameras }: { report: CheckReport; cameras: readonly CheckedCamera[] }) {
   const posed = report.with_pose;
+  const own = largest(cameras);
   return (
     <>
       <Line mark="good" name="Images">
-        {count(report.images, "image")}, all readable{report.format !== ALONE && `; poses from ${report.format}`}
+        {count(report.images, "image")}
+        {own && ` of ${new Set(cameras.map(pixels)).size > 1 ? "up to " : ""}${pixels(own)}`}, all readable{report.format !== ALONE && `; poses from ${report.format}`}
       </Line>
       <Line mark={report.without_pose ? "note" : "good"} name="Poses">
         {posed} of {report.images} given

@@ -55,7 +55,7 @@ export function NewJob({ dataset }: { dataset: DatasetView }) {
             {masks.painted.size > 0 && <span class="soft">Save the masks first, below.</span>}
           </p>
         </Plan>
-        <CheckTable dataset={dataset} />
+        <CheckTable dataset={dataset} cameras={photos?.list.cameras ?? []} />
       </div>
       {photos && (
         <div class="set-views">

@@ -3,7 +3,7 @@ import type { ComponentChildren } from "preact";
 import type { CheckReport } from "schemas";
 import { count } from "../../../biresnerf/viewer/widgets/numbers";
 import { Presets } from "../options/form";
-import type { Values } from "../options/schema";
+import { changesTimes, type Values } from "../options/schema";
 
 interface Props {
   report: CheckReport;
@@ -15,7 +15,7 @@ interface Props {
 }
 
 export function Plan({ report, values, leftOut, onPreset, children }: Props) {
-  const altered = ["steps", "time_budget_s", "max_image_size", "samples_per_step"].some((name) => name in values);
+  const altered = changesTimes(values);
   return (
     <section class="card plan" aria-labelledby="plan-heading">
       <h2 id="plan-heading">What will happen</h2>
@@ -25,7 +25,7 @@ export function Plan({ report, values, leftOut, onPreset, children }: Props) {
       <ol>
         {leftOut > 0 && <li>{count(leftOut, "photo")} of {report.images} {leftOut === 1 ? "is" : "are"} left out.</li>}
         <li>{startWords(report, String(values.start ?? "auto"))}</li>
-        <li>A model of the scene is learnt from the photos, and the cameras move until photos and model agree.</li>
+        <li>A model of the scene is learnt from the photos (of large ones, from smaller copies), and the cameras move until photos and model agree.</li>
         <li>
           {values.verdict === false
             ? "You get the refined poses, untested."

@@ -50,8 +50,30 @@ def test_a_model_with_masks_and_unregistered_images_is_told_as_it_is(tmp_path: P
     assert (plan["preset"], plan["steps"], plan["working_size"]) == ("fast", 100, [16, 13])
     assert plan["photo_bytes"] == 4 * 3 * 16 * 13
     text = CliRunner().invoke(inspect_command, [str(tmp_path)]).output
-    assert "3 with a pose, 1 without" in text
-    assert "no pose: " in text
+    assert f"3 with a pose, 1 without: {found['without_pose'][0]}\n" in text
+
+
+def test_photos_without_a_pose_are_said_in_one_line_however_many(tmp_path: Path) -> None:
+    trajectories.colmap_set(tmp_path, registered=3)
+    for index in range(20):
+        write_image(tmp_path / f"images/more{index:02}.png", seed=100 + index)
+    without = inspected(tmp_path)["without_pose"]
+    assert len(without) == 21
+    text = CliRunner().invoke(inspect_command, [str(tmp_path)]).output
+    (line,) = [line for line in text.splitlines() if " without: " in line]
+    assert line == f"  3 with a pose, 21 without: {', '.join(without[:3])} and 18 more"
+    assert sum(name in text for name in without) <= 6, "and a warning that names a few"
+
+
+def test_the_size_to_learn_at_is_told_from_the_photos_own(tmp_path: Path) -> None:
+    trajectories.colmap_set(tmp_path)
+    for own, asked in ((False, 16), (True, 4096)):
+        arguments = [str(tmp_path), "--set", f"max_image_size={asked}"]
+        said = CliRunner().invoke(inspect_command, arguments).output
+        assert "4 images of 20 x 16 px" in said
+        assert ("copies shrunk to 16 x 13 px" in said) is not own
+        assert ("photos and results keep the full size" in said) is not own
+        assert ("learn from the photos at their own size" in said) is own
 
 
 @pytest.mark.parametrize(
