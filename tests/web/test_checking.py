@@ -31,6 +31,6 @@ def test_a_check_shows_how_many_photos_of_how_many_are_read(
     expect(waiting).to_contain_text("being checked (3 of 10 photos read)")
     page.goto(url)
     (service.data_dir / "go").touch()
-    expect(images).to_contain_text("10 images, all readable")
+    expect(images).to_contain_text("10 images of 40 × 40 px, all readable")
     expect(images.get_by_role("progressbar")).to_have_count(0)
     assert (tab.outside, tab.complaints) == ([], [])
