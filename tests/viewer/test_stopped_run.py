@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from playwright.sync_api import Browser, expect
 
 from biresnerf.errors import Interrupted
 from biresnerf.pipeline import refine_poses
-from biresnerf.viewer.report_html import read_report
+from biresnerf.viewer.report_html import read_report, write_report_html
 from tests.viewer.conftest import OPTIONS, VIEWS, Opened, Result, open_report
 
 STOPPED_AT = 60
@@ -51,6 +52,20 @@ def test_a_stopped_runs_page_says_at_which_step_and_that_nothing_is_final(
     expect(verdict).to_contain_text(report.verdict_so_far.why[0])
     expect(page.get_by_text("Views are rendered at the end of a run.")).to_be_visible()
     expect(page.locator(".curves-stages")).to_contain_text("the run was stopped before stage 2")
+    page.context.close()
+
+
+def test_names_of_photos_can_be_hit_also_where_no_small_photos_are_there_yet(
+    browser: Browser, result: Result, tmp_path: Path
+) -> None:
+    folder = shutil.copytree(result.folder, tmp_path / "out")
+    (folder / "view.json").unlink()
+    assert write_report_html(folder, result.report) == ()
+    page = open_report(browser, folder / "report.html").page
+    expect(page.locator(".images .thumb")).to_have_count(0)
+    boxes = [name.bounding_box() for name in page.locator(".images tbody button").all()]
+    assert len(boxes) == VIEWS
+    assert min(box["height"] for box in boxes if box) >= 24  # px, of WCAG 2.5.8
     page.context.close()
 
 

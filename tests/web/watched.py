@@ -57,7 +57,7 @@ class Watched:
         self.page.evaluate(AXE.read_text())
         found: dict[str, Any] = self.page.evaluate(f"axe.run(document, {AXE_OPTIONS})")
         return [
-            f"{one['id']}: {node['target']} {node['failureSummary']}"
+            f"{one['id']}: {node['target']} {node['html']} {node['failureSummary']}"
             for one in found["violations"]
             if one["impact"] in SERIOUS
             for node in one["nodes"]
