@@ -70,6 +70,7 @@ async def _unpacked(service: Service, dataset_id: str, archive: Path, upload_id:
         into=into,
         files_max=settings.max_files - dataset.files,
         bytes_max=min(allowed, room),
+        all_room=room < allowed,
         file_bytes_max=settings.max_file_bytes,
         ratio_max=RATIO_MAX,
     )
@@ -78,13 +79,8 @@ async def _unpacked(service: Service, dataset_id: str, archive: Path, upload_id:
         memory_bytes=service.memory.unpack,
         file_bytes=settings.max_file_bytes + 2**20,
     )
-    try:
-        async with service.unpacking.turn(dataset.tenant), service.stores.uploads.unpacking(upload_id):
-            await run_confined("service.intake.unpack", request, limits)
-    except ProblemError as error:
-        if error.code == "archive_too_large" and room < allowed:
-            raise ProblemError("storage_full", "There is no room to unpack the archive.") from None
-        raise
+    async with service.unpacking.turn(dataset.tenant), service.stores.uploads.unpacking(upload_id):
+        await run_confined("service.intake.unpack", request, limits)
     return await asyncio.to_thread(content_root, into)
 
 

@@ -50,6 +50,7 @@ class UnpackRequest(FrozenModel):
 
     archive: Path
     into: Path = Field(description="An empty folder of this process.")
+    all_room: bool = Field(False, description="Whether `bytes_max` is what the disk has room for.")
     files_max: int
     bytes_max: int = Field(description="Bytes of all files together.")
     file_bytes_max: int = Field(description="Bytes of one file.")
@@ -155,6 +156,8 @@ class _Sink:
 
     def over_budget(self) -> InputError:
         """The error for an archive that unpacks to more than is allowed."""
+        if self.request.all_room and not self._by_ratio:
+            return InputError("storage_full", "There is no room to unpack the archive.", where="")
         what = f"The archive unpacks to more than {self.budget} bytes."
         if self._by_ratio:
             what = f"The archive unpacks to more than {self.request.ratio_max:g} times its size."

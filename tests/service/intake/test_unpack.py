@@ -84,8 +84,15 @@ def test_a_limit_admits_what_equals_it_and_refuses_one_more(
 def test_an_archive_that_unpacks_to_many_times_its_size_is_refused(tmp_path: Path):
     write_zip(tmp_path / "archive", {"zeros.png": bytes(RATIO_FREE_BYTES + 2**20)})
     with pytest.raises(InputError, match="more than 2 times its size") as refused:
-        unpack(request(tmp_path / "archive", ratio_max=2.0))
+        unpack(request(tmp_path / "archive", ratio_max=2.0, all_room=True))
     assert refused.value.code == "archive_too_large"
+
+
+def test_an_archive_for_which_the_disk_has_no_room_is_not_at_fault(tmp_path: Path):
+    write_zip(tmp_path / "archive", FILES)
+    with pytest.raises(InputError, match="no room") as refused:
+        unpack(request(tmp_path / "archive", bytes_max=TOTAL - 1, all_room=True))
+    assert refused.value.code == "storage_full"
 
 
 @pytest.mark.parametrize("kind", WRITERS)
