@@ -264,12 +264,13 @@ def test_a_job_is_run_again_ended_and_deleted(
     options = api.get(f"/jobs/{job}").json()["options"]
     assert options == {**done["options"], "steps": 20000}
     page.get_by_label("Notify me when it ends").check()
+    expect(page.get_by_role("status").filter(has_text="Now: ")).to_have_count(1)  # it has begun
     page.get_by_role("button", name="Cancel", exact=True).click()
     page.get_by_role("button", name="Cancel and keep nothing").click()
     expect(page.get_by_role("heading", level=1)).to_contain_text("cancelled")
     expect(page.get_by_text("Its poses were not kept, so there is no result and no verdict")).to_be_visible()
     expect(page.locator(".run-words")).to_have_text(
-        re.compile(r"cancelled( at step \d+ of \d+| while \w+.*)?, after .*")
+        re.compile(r"cancelled (at step \d+ of \d+|while \w+.*), after .*")
     )
     assert page.evaluate("window.told") == ["kitchen: cancelled"]
     page.get_by_role("button", name="Delete", exact=True).click()
