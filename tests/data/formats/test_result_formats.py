@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from biresnerf.data.formats.registry import ALL_CODECS
 from biresnerf.data.formats.result_formats import write_result_formats
 from biresnerf.data.formats.simple.bundler import write_bundler
 from biresnerf.data.formats.simple.llff import write_llff
@@ -21,7 +20,6 @@ from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import FAMILY_MODELS, MODEL_PARAMETERS
 from biresnerf.options.formats import formats
-from biresnerf.options.refine_options import RefineOptions
 from tests.data.formats.random_sets import random_result
 from tests.data.formats.readers import (
     bundler_cameras,
@@ -289,10 +287,3 @@ def test_all_exports_are_written_and_those_that_cannot_be_say_why(tmp_path):
     }
     always = {name for name, one in formats().items() if one.always}
     assert always == {"transforms", "nerfstudio", "colmap", "tum", "scene", "points", "poses", "csv"}
-
-
-def test_every_export_that_may_be_asked_for_has_a_writer():
-    [allowed] = RefineOptions.model_fields["exports"].annotation.__args__[:1]
-    asked = {"colmap-text", "instant-ngp", "kitti", "bundler", "pinhole"}
-    assert set(allowed.__args__) == asked | {"opensfm", "meshroom", "openmvg", "realitycapture", "neus"}
-    assert all(ALL_CODECS[name].write is not None for name in allowed.__args__)
