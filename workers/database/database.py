@@ -25,6 +25,7 @@ log = logging.getLogger(__name__)
 AWAY = (
     *(psycopg.OperationalError, psycopg.InterfaceError, PoolTimeout, PoolClosed),
     psycopg.errors.IdleInTransactionSessionTimeout,
+    psycopg.errors.FeatureNotSupported,  # by a statement prepared before a migration; the next one is prepared anew
 )
 # A peer that vanished silently (a host that lost power) is noticed within a minute.
 CONNECT: dict[str, Any] = {

@@ -18,6 +18,7 @@ from tests.workers.conftest import PROGRAM, SHORT_STALL, Counting, Slots, quick_
 from tests.workers.queue.test_exports_beside import EXPORTS
 from workers.database import job_queue, migrate
 from workers.engine import Stores, open_stores
+from workers.settings.errors import Unavailable
 from workers.settings.settings import Settings
 from workers.store.files import open_files
 
@@ -224,3 +225,17 @@ async def test_a_filled_database_of_the_first_release_goes_on_in_this_version(
             "SELECT count(*) AS n FROM jobs WHERE checkpoint IS NOT NULL"
         )
         assert row["n"] == 0
+
+
+async def test_a_process_that_runs_when_columns_are_added_fails_for_a_moment_at_most(
+    database_url: str, tmp_path: Path
+):
+    async with open_stores(quick_settings(tmp_path, database_url=database_url)) as stores:
+        dataset = await stores.datasets.create("kitchen")
+        for _ in range(10):  # after five, a connection has the statement prepared
+            await stores.datasets.get(dataset.id)
+        with psycopg.connect(database_url) as connection:
+            connection.execute("ALTER TABLE datasets ADD COLUMN later int")
+        with pytest.raises(Unavailable):
+            await stores.datasets.get(dataset.id)
+        assert await stores.datasets.get(dataset.id) == dataset
