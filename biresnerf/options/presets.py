@@ -83,9 +83,6 @@ METHOD_VALUES: dict[MethodName, dict[str, Any]] = {
 # Values that it sets in the preset `paper` alone: its published length and batch (1024 rays of 128 samples, or of about
 # 32 where empty space is skipped).
 METHOD_PAPER_VALUES: dict[MethodName, dict[str, Any]] = {
-    "biresnerf": {},
-    "biresnerf-paper": {},
-    "baa-ngp": {},
     "nerfacc-barf": {"steps": 200_000, "samples_per_step": 2**15},
     "barf": {"steps": 200_000, "samples_per_step": 2**17},
 }
@@ -97,7 +94,7 @@ def preset_values(
     """Values of options that are left out. `steps`: as requested; None if left out as well."""
     values = {**COMMON_VALUES, **PRESETS[preset], **METHOD_VALUES[method]}
     if preset == "paper":
-        values |= METHOD_PAPER_VALUES[method]
+        values |= METHOD_PAPER_VALUES.get(method, {})
     elif device == "cuda":
         values |= {key: values[key] * factor for key, factor in CUDA_SCALE.items()}
     return values if steps is None else values | in_proportion(values, steps)

@@ -89,7 +89,7 @@ def _methods() -> str:
     for name, values in METHOD_VALUES.items():
         for title, filled in (
             (f"`{name}`", values),
-            (f"`{name}` in the preset `paper`", METHOD_PAPER_VALUES[name]),
+            (f"`{name}` in the preset `paper`", METHOD_PAPER_VALUES.get(name)),
         ):
             if filled:
                 rows.append((title, ", ".join(f"`{key}={_plain(value)}`" for key, value in filled.items())))

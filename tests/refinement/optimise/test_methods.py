@@ -34,13 +34,6 @@ SMALL_GRID = {
     "reconstruction_resolution_max": 64,
 }
 FEW_SAMPLES = {"samples_per_step": 1024}
-SMALL = {
-    "biresnerf": {},
-    "biresnerf-paper": {},
-    "baa-ngp": SMALL_GRID,
-    "nerfacc-barf": FEW_SAMPLES,
-    "barf": FEW_SAMPLES,
-}
 NARROW = 16  # units of BARF's network here, which is as deep as ever
 METHODS = get_args(MethodName)
 EACH = pytest.mark.parametrize("method", METHODS)
@@ -49,7 +42,8 @@ EACH = pytest.mark.parametrize("method", METHODS)
 def small_options(method: str, **changed) -> RefineOptions:
     """As `tiny_run`, 20 steps with the switch after 10, for a method."""
     steps = {"steps": 20, "coarse_steps_min": 10, "coarse_steps_max": 10, "max_image_size": 16}
-    return tiny_run(method=method, **{**steps, **SMALL[method], **changed})
+    small = SMALL_GRID if method == "baa-ngp" else FEW_SAMPLES if find_method(method).large_network else {}
+    return tiny_run(method=method, **{**steps, **small, **changed})
 
 
 @pytest.fixture(autouse=True, scope="module")
