@@ -66,7 +66,7 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
     )
     method: Annotated[MethodName, Option("coarse", "Method", level="research")] = Field(
         "biresnerf",
-        description="biresnerf-paper: the two stages as published; the last three: other published methods.",
+        description="biresnerf-paper: the two stages as published; those after it: other published methods.",
     )
     field: Annotated[Literal["kernels", "reference"], Option("coarse", "Field", level="research")] = Field(
         "kernels",
