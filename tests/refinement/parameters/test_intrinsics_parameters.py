@@ -29,37 +29,20 @@ from biresnerf.refinement.parameters.intrinsics_parameters import (
 from biresnerf.refinement.parameters.pose_parameters import PoseParameters, dolly_directions
 from biresnerf.refinement.scene.scene_frame import scene_frame
 from biresnerf.refinement.verdict.run_report import camera_reports
+from tests.geometry.camera.lenses import CAMERAS, HEIGHT, WIDTH
 from tests.refinement.tiny_scene import photos_set, tiny_optimiser, tiny_options, tiny_set
 
 pytestmark = pytest.mark.slow
 
 CPU = torch.device("cpu")
-CAMERAS = {
-    "SIMPLE_PINHOLE": (60.0, 30.0, 20.0),
-    "PINHOLE": (60.0, 62.0, 31.0, 19.0),
-    "SIMPLE_RADIAL": (60.0, 30.0, 20.0, 0.05),
-    "RADIAL": (60.0, 30.0, 20.0, 0.05, -0.01),
-    "OPENCV": (60.0, 62.0, 31.0, 19.0, 0.05, -0.01, 0.001, -0.002),
-    "FULL_OPENCV": (60.0, 62.0, 31.0, 19.0, 0.05, -0.01, 0.001, -0.002, 0.02, 0.03, -0.01, 0.01),
-    "SIMPLE_RADIAL_FISHEYE": (40.0, 30.0, 20.0, 0.02),
-    "RADIAL_FISHEYE": (40.0, 30.0, 20.0, 0.02, -0.01),
-    "THIN_PRISM_FISHEYE": (40.0, 41.0, 31.0, 19.0, 0.02, -0.01, 0.001, -0.002, 0.003, -0.001, 0.002, 0.001),
-    "SIMPLE_FISHEYE": (40.0, 30.0, 20.0),
-    "FISHEYE": (40.0, 41.0, 31.0, 19.0),
-    "FOV": (40.0, 41.0, 31.0, 19.0, 0.9),
-    "SIMPLE_DIVISION": (40.0, 30.0, 20.0, -0.2),
-    "DIVISION": (30.0, 31.0, 31.0, 19.0, -0.2),
-    "EUCM": (30.0, 31.0, 31.0, 19.0, 0.6, 1.1),
-    "OPENCV_FISHEYE": (40.0, 41.0, 31.0, 19.0, 0.02, -0.01, 0.003, -0.001),
-}
 
 
 def lens(model: str, params: tuple[float, ...] | None = None) -> Camera:
-    return Camera(model, 60, 40, CAMERAS[model] if params is None else params)
+    return Camera(model, WIDTH, HEIGHT, params or CAMERAS[model]).resized(64, 48)
 
 
 def parameters(camera: Camera, part="all", images: int = 2, held_out=()) -> IntrinsicsParameters:
-    working = [camera.resized(30, 20)] * images
+    working = [camera.resized(32, 24)] * images
     return IntrinsicsParameters([camera], [0] * images, [part], working, held_out, CPU)
 
 
@@ -79,7 +62,7 @@ def test_the_working_intrinsics_are_those_of_the_written_camera(model):
     written = lenses.refined_working([lens(model)] * 2)[0]
     assert written.model == model
     assert all(a != b for a, b in zip(written.params, lens(model).params, strict=True))
-    expected = Intrinsics.from_cameras([written.resized(30, 20)] * 2)
+    expected = Intrinsics.from_cameras([written.resized(32, 24)] * 2)
     for name in ("fx", "fy", "cx", "cy", "distortion"):
         torch.testing.assert_close(
             getattr(lenses.intrinsics, name), getattr(expected, name), atol=1e-12, rtol=1e-12

@@ -21,47 +21,16 @@ from tests.data.formats.colmap.colmap_files import (
     write_tables,
 )
 from tests.data.test_real_sets import ROOT
+from tests.geometry.camera.lenses import CAMERAS, HEIGHT, WIDTH
 
 pytestmark = pytest.mark.slow
-
-PARAMETERS = {
-    "SIMPLE_PINHOLE": [700.0, 320.5, 240.25],
-    "PINHOLE": [700.0, 710.0, 320.5, 240.25],
-    "SIMPLE_RADIAL": [700.0, 320.5, 240.25, 0.01],
-    "RADIAL": [700.0, 320.5, 240.25, 0.01, -0.002],
-    "OPENCV": [700.0, 710.0, 320.5, 240.25, 0.01, -0.002, 0.0005, -0.0003],
-    "FULL_OPENCV": [700.0, 710.0, 320.5, 240.25, 0.01, -0.002, 5e-4, -3e-4, 1e-3, 2e-3, -1e-3, 1e-4],
-    "SIMPLE_RADIAL_FISHEYE": [400.0, 320.5, 240.25, 0.01],
-    "RADIAL_FISHEYE": [400.0, 320.5, 240.25, 0.01, -0.002],
-    "THIN_PRISM_FISHEYE": [
-        400.0,
-        410.0,
-        320.5,
-        240.25,
-        0.01,
-        -0.002,
-        5e-4,
-        -3e-4,
-        1e-3,
-        -1e-4,
-        8e-4,
-        -6e-4,
-    ],
-    "SIMPLE_FISHEYE": [400.0, 320.5, 240.25],
-    "FISHEYE": [400.0, 410.0, 320.5, 240.25],
-    "FOV": [500.0, 510.0, 320.5, 240.25, 0.9],
-    "SIMPLE_DIVISION": [500.0, 320.5, 240.25, -0.2],
-    "DIVISION": [500.0, 510.0, 320.5, 240.25, -0.2],
-    "EUCM": [400.0, 410.0, 320.5, 240.25, 0.6, 1.1],
-    "OPENCV_FISHEYE": [400.0, 410.0, 320.5, 240.25, 0.01, -0.002, 1e-3, -1e-4],
-}
 
 
 def synthetic(seed: int, model: str, folder, rigs: int = 2, cameras_per_rig: int = 1):
     options = {
         "num_rigs": rigs, "num_cameras_per_rig": cameras_per_rig, "num_frames_per_rig": 3, "num_points3D": 20,
-        "camera_width": 640, "camera_height": 480, "num_points2D_without_point3D": 3,
-        "camera_model_id": model, "camera_params": PARAMETERS[model],
+        "camera_width": WIDTH, "camera_height": HEIGHT, "num_points2D_without_point3D": 3,
+        "camera_model_id": model, "camera_params": CAMERAS[model],
     }  # fmt: skip
     return {"seed": seed, "folder": str(folder), "options": options}
 
@@ -110,11 +79,11 @@ def assert_reads_as_pycolmap(model: ColmapModel, said):
 
 
 def test_every_supported_camera_model_is_among_those_tested():
-    assert PARAMETERS.keys() == MODEL_IDS.keys()
+    assert CAMERAS.keys() == MODEL_IDS.keys()
 
 
 def test_random_models_of_every_camera_model_and_with_rigs_read_as_pycolmap_reads_them(tmp_path):
-    made = [synthetic(seed, model, tmp_path / model) for seed, model in enumerate(PARAMETERS)]
+    made = [synthetic(seed, model, tmp_path / model) for seed, model in enumerate(CAMERAS)]
     made += [synthetic(s, "PINHOLE", tmp_path / f"rig{s}", 1 + s % 2, cameras_per_rig=3) for s in (90, 91)]
     answers = by_pycolmap(made)
     for one, said in zip(made, answers, strict=True):
