@@ -23,6 +23,7 @@ from biresnerf.geometry.perturb import perturb_poses
 from tests.data.formats.random_sets import random_camera, random_model, random_poses, random_result
 from tests.data.formats.readers import ours, seen_points, through_json_frame
 from tests.data.scenes import HEIGHT, WIDTH, assert_complete, nerfstudio_scene, save, write_image
+from tests.geometry.camera.lenses import BEYOND_OPENCV
 
 # What nerfstudio 1.1.5 knows (nerfstudio/cameras/cameras.py, CAMERA_MODEL_TO_TYPE).
 NERFSTUDIO_MODELS = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"}
@@ -55,7 +56,7 @@ def lint_for_nerfstudio(document):
     assert len({frame["file_path"] for frame in document["frames"]}) == len(document["frames"])
 
 
-@pytest.mark.parametrize("model", sorted(set(FAMILY_MODELS) - {"FULL_OPENCV", "THIN_PRISM_FISHEYE"}))
+@pytest.mark.parametrize("model", sorted({*FAMILY_MODELS} - {*BEYOND_OPENCV}))
 @pytest.mark.parametrize("several", [False, True])
 def test_nerfstudio_sees_points_where_we_do(tmp_path, model, several):
     dataset = posed_dataset(*[model] * (2 if several else 1))
@@ -73,10 +74,9 @@ def test_nerfstudio_sees_points_where_we_do(tmp_path, model, several):
 @pytest.mark.parametrize("several", [False, True])
 def test_the_file_for_nerfstudio_follows_its_rules_whatever_the_input_was(tmp_path, model, several):
     refined = random_result(11, model=model, several=several)
-    beyond = {"FULL_OPENCV": ("k4", "k5", "k6"), "THIN_PRISM_FISHEYE": ("p1", "p2", "sx1", "sy1")}
-    if model in beyond:  # without these terms, nerfstudio has that lens
+    if model in BEYOND_OPENCV:  # without these terms, nerfstudio has that lens
         named = [dict(zip(MODEL_PARAMETERS[model], camera.params, strict=True)) for camera in refined.cameras]
-        flat = [tuple((values | dict.fromkeys(beyond[model], 0.0)).values()) for values in named]
+        flat = [tuple((values | dict.fromkeys(BEYOND_OPENCV[model], 0.0)).values()) for values in named]
         cameras = [replace(c, params=params) for c, params in zip(refined.cameras, flat, strict=True)]
         refined = replace(refined, cameras=tuple(cameras))
     write_nerfstudio(refined, tmp_path / "t.json")

@@ -32,8 +32,9 @@ from tests.data.formats.readers import (
     tum_poses,
 )
 from tests.data.scenes import assert_complete
+from tests.geometry.camera.lenses import BEYOND_OPENCV
 
-NGP_MODELS = sorted(set(FAMILY_MODELS) - {"FULL_OPENCV", "THIN_PRISM_FISHEYE"})
+NGP_MODELS = sorted({*FAMILY_MODELS} - {*BEYOND_OPENCV})
 CLOSE_PX = 0.01
 
 

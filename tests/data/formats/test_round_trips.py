@@ -24,6 +24,7 @@ from biresnerf.geometry.camera.camera_models import MODEL_PARAMETERS, Camera
 from biresnerf.geometry.camera.carried_lenses import SHAPES
 from tests.data.formats.random_sets import HEIGHT, WIDTH, random_camera, random_poses
 from tests.data.scenes import write_image
+from tests.geometry.camera.lenses import BEYOND_OPENCV
 
 NAMES = ("c.png", "a.png", "b/a.png", "d.png")  # neither sorted nor of one folder
 
@@ -106,7 +107,7 @@ def test_lenses_poses_and_names_come_back_where_the_form_can_hold_them(
         ]
     poses = random_poses(rng, len(NAMES))
     dataset = image_set(folder, cameras, poses)
-    too_much = form == "transforms_ngp.json" and model in ("FULL_OPENCV", "THIN_PRISM_FISHEYE", *SHAPES)
+    too_much = form == "transforms_ngp.json" and model in {*BEYOND_OPENCV, *SHAPES}
     if too_much or (form == "bundle.out" and LENSES.problem(cameras[0])):
         with pytest.raises(InputError) as caught:
             write_as(form, dataset, poses, folder)

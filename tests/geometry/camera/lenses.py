@@ -37,3 +37,5 @@ CAMERAS = {
     "DIVISION": (300.0, 302.0, 322.0, 236.0, -0.3),
     "EUCM": (260.0, 261.0, 318.0, 243.0, 0.62, 1.08),
 }
+# Models with coefficients that OPENCV and OPENCV_FISHEYE lack: those of them that nerfstudio lacks as well.
+BEYOND_OPENCV = {"FULL_OPENCV": ("k4", "k5", "k6"), "THIN_PRISM_FISHEYE": ("p1", "p2", "sx1", "sy1")}
