@@ -40,6 +40,7 @@ SECTIONS = (
         {
             "refine": "biresnerf.commands.poses.refine:refine_command",
             "inspect": "biresnerf.commands.poses.inspect:inspect_command",
+            "split": "biresnerf.commands.poses.split:split_command",
             "evaluate": "biresnerf.commands.poses.evaluate:evaluate_command",
             "compare-results": "biresnerf.commands.poses.compare_results:compare_results_command",
             "convert": "biresnerf.commands.poses.convert:convert_command",

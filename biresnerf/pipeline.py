@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -18,12 +18,14 @@ from biresnerf.data.given_poses.likely_reading import as_warning, pose_question
 from biresnerf.data.given_poses.readings import read_as
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.part_of_set import without_photos
+from biresnerf.data.parts.join_parts import AskParts
 from biresnerf.data.photos.alike.copied_photos import without_copies
 from biresnerf.data.photos.guessed_lens import with_shared_predictions
 from biresnerf.data.photos.images import load_by_content, load_images
 from biresnerf.data.photos.panoramas.cut_panoramas import called_panoramas, cut_panoramas
 from biresnerf.data.photos.video.video_frames import VideoReading
 from biresnerf.data.points.tracks import Tracks
+from biresnerf.data.seeding.cached_mapping import joined_parts
 from biresnerf.data.seeding.seed_poses import seed_poses
 from biresnerf.errors import Interrupted
 from biresnerf.field.backends import resolve_here, use_threads
@@ -75,15 +77,14 @@ class Observer:
 
 def refine_poses(
     input: str | Path | Dataset,
-    output: str | Path,
+    output: str | Path | OutputFolder,
     options: RefineOptions,
     on_progress: OnProgress | None = None,
     should_stop: Callable[[], bool] | None = None,
     observer: Observer | None = None,
     *,
     method: Method | None = None,
-    keep_reusable: bool = False,
-    title: str | None = None,
+    parts: Sequence[Path] = (),
 ) -> Report:
     """Refine the poses of an image set; all results go to the folder `output`.
 
@@ -92,14 +93,15 @@ def refine_poses(
 
     Args:
         input: a folder of images (with or without a transforms file), a transforms file, or a set already read.
-        output: a folder that is empty, new, or holds an unfinished run of the same input and options.
+        output: a folder that is empty, new, or holds an unfinished run of the same input and options. An `OutputFolder`
+            says what stays in it, and the report's title.
         on_progress: called with a `Progress` a few times a second.
         should_stop: called after every step, view, frame and photo; once true, a checkpoint and a partial result are
             written.
         observer: observes the run, for comparisons with the truth.
         method: replaces the one that the options name, e.g. ``dataclasses.replace(BIRESNERF, repair=False)``.
-        keep_reusable: leave in `output`/checkpoint what other runs of the set can start from.
-        title: heading of the report; by default the name of the folder of a set already read.
+        parts: results of parts of the set (`biresnerf.data.parts.cut_set`): poses and matches are taken from them in
+            COLMAP's place, and then all cameras are adjusted together.
 
     Raises:
         InputError: the user can fix it.
@@ -108,11 +110,15 @@ def refine_poses(
             initial poses were still being computed.
     """
     started, share = time.monotonic(), ProcessorShare()
-    if title is None and isinstance(input, Dataset):
-        title = _title_of(input.root)
-    folder = OutputFolder(Path(output), keep_reusable=keep_reusable, title=title)
+    if isinstance(output, OutputFolder):
+        folder = output
+    else:
+        folder = OutputFolder(
+            Path(output), title=_title_of(input.root) if isinstance(input, Dataset) else None
+        )
     with share.watching(), KernelCompilation() as kernels:
         setup = _set_up(folder, options, method, on_progress, should_stop, share, kernels)
+        setup = replace(setup, parts=tuple(parts))
         return _refine(input, setup, observer or Observer(), started)
 
 
@@ -124,7 +130,9 @@ def _title_of(root: Path) -> str | None:
 
 def _refine(input: str | Path | Dataset, setup: _Setup, observer: Observer, started: float) -> Report:
     dataset = input if isinstance(input, Dataset) else _read(Path(input), setup)
-    dataset = without_copies(without_photos(dataset, setup.asked.leave_out), setup.asked.fixed)
+    dataset = without_copies(
+        without_photos(dataset, setup.asked.leave_out, setup.asked.photos), setup.asked.fixed
+    )
     dataset = with_shared_predictions(dataset)
     dataset = _as_meant(dataset, setup)
     dataset = replace(dataset, positions=position_priors(dataset), control=control_points(dataset))
@@ -140,6 +148,7 @@ def _refine(input: str | Path | Dataset, setup: _Setup, observer: Observer, star
         """The report, after the result."""
         renderer, recipe, at = optimiser.renderer, optimiser.recipe, optimiser.step_state()
         report = run_report(scene, renderer, recipe, at, run.record, stages.repair.repaired, found)
+        report = report.model_copy(update={"parts": joined_parts(setup.folder.path / SEEDING)})
         return write_result(
             setup.folder, scene, renderer.joint, setup.monitor, evaluation, report, found.so_far
         )
@@ -183,6 +192,7 @@ class _Setup:
         asked: the options as the user gave them.
         recipe: with the options resolved for this machine.
         earlier: work of another run that this one continues.
+        parts: results of parts of the set.
     """
 
     folder: OutputFolder
@@ -191,6 +201,7 @@ class _Setup:
     earlier: Checkpoint | None
     monitor: Monitor
     kernels: KernelCompilation
+    parts: tuple[Path, ...] = ()
 
 
 def _set_up(
@@ -256,6 +267,7 @@ def _seed(dataset: Dataset, setup: _Setup) -> tuple[Scene, RunOrigin]:
             remember=folder.path / SEEDING,
             on_progress=preview,
             takes_back_offset=not bodies.tied,
+            ask=AskParts(setup.parts) if setup.parts else None,
         )
         preview.show_candidate(seeding)
     load = load_by_content if setup.asked.max_image_size is None else load_images

@@ -9,13 +9,20 @@ from pydantic import Field, computed_field, model_validator
 from biresnerf.errors import Fault
 from biresnerf.frozen_model import FrozenModel
 from biresnerf.options.refine_options import ResolvedOptions
-from biresnerf.uncertainty import ControlReport, GeoReference, InputAccuracy, KnownScale, PoseUncertainty
+from biresnerf.uncertainty import (
+    ControlReport,
+    GeoReference,
+    InputAccuracy,
+    KnownScale,
+    PartsReport,
+    PoseUncertainty,
+)
 
 SwitchReason = Literal["stable", "cap"]
 IntrinsicsSource = Literal["given", "maker", "exif", "predicted", "colmap", "guessed", "refined"]
 PoseSource = Literal[
-    "given", "colmap", "matches-incremental", "matches-global", "neighbours", "nearest-view", "forward-facing",
-    "turntable", "gimbal",
+    "given", "colmap", "matches-incremental", "matches-global", "matches-parts", "neighbours", "nearest-view",
+    "forward-facing", "turntable", "gimbal",
 ]  # fmt: skip
 CandidateName = Literal["input", "matched", "refined", "adjusted-tracks", "adjusted-patches", "adjusted"]
 VerdictName = Literal["improved", "unchanged", "kept_input", "inconclusive", "failed_check"]
@@ -306,6 +313,7 @@ class Report(FrozenModel):
     geo_reference: GeoReference | None = Field(None, description="None without measured positions.")
     control_points: ControlReport | None = Field(None, description="None without a list of them.")
     known_scale: KnownScale | None = Field(None, description="None without the option known_distance.")
+    parts: PartsReport | None = Field(None, description="None where the set was refined as one.")
     steps_done: int = Field(examples=[2000])
     switch_step: int | None = Field(None, examples=[700], description="The step at which stage 2 began.")
     switch_reason: SwitchReason | None = Field(None, examples=["stable"])

@@ -123,6 +123,43 @@ class KnownScale(FrozenModel, allow_inf_nan=False):
     metres_per_unit: float = Field(examples=[0.31], description="Of the input's world.")
 
 
+class PartReport(FrozenModel):
+    """A part of a large set that was refined by itself."""
+
+    name: str = Field(examples=["part-03"])
+    photos: int = Field(examples=[400])
+    why_not: str | None = Field(
+        None,
+        examples=["it shares fewer than 3 photos with the others"],
+        description="Why it did not join the others; None: it did.",
+    )
+
+
+class SeamReport(FrozenModel, allow_inf_nan=False):
+    """How far two parts disagree on the photos that both have, once one is carried onto the other by these."""
+
+    parts: tuple[str, str] = Field(examples=[["part-03", "part-04"]])
+    photos: int = Field(examples=[62], description="That both have.")
+    rotation_deg: float = Field(examples=[0.02], description="Median.")
+    rotation_deg_worst: float = Field(examples=[0.08])
+    position: float = Field(examples=[0.01], description="Of the centres, median; the input's unit.")
+    position_worst: float = Field(examples=[0.04])
+    within: float | None = Field(
+        None,
+        examples=[0.95],
+        description="Share of the photos on which the parts disagree by no more than their bounds for nine in ten "
+        "errors allow. None where no bounds are known.",
+    )
+
+
+class PartsReport(FrozenModel):
+    """The parts that a result was joined from, before all cameras were adjusted together."""
+
+    parts: tuple[PartReport, ...]
+    seams: tuple[SeamReport, ...] = ()
+    photos_left_out: int = Field(0, description="Which no part that joined has placed.")
+
+
 class InputAccuracy(FrozenModel):
     """How accurate the input's poses are, measured against the poses that tracks and patches gave.
 

@@ -130,6 +130,11 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
     bad_frames: Annotated[Literal["leave_out", "refuse"], Option("seeding", "Bad frames")] = Field(
         "leave_out", description="Frames whose photo, pose or lens is missing or broken, where most are good."
     )
+    photos: Annotated[Names, Option("seeding", "Photos to use", level="usual")] = Field(
+        (),
+        max_length=10_000,
+        description="Names of photos to use, as if the set had no others; empty: all of them.",
+    )
     leave_out: Annotated[Names, Option("seeding", "Photos to leave out", level="usual")] = Field(
         (), max_length=10_000, description="Names of photos to treat as if they were not in the set."
     )

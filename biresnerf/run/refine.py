@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from biresnerf.data.formats.read_dataset import read_dataset
+from biresnerf.data.formats.simple.poses_json import POSES
 from biresnerf.data.photos.video.video_frames import VideoReading
+from biresnerf.errors import InputError
 from biresnerf.openmp import let_waiting_threads_sleep
 from biresnerf.options.presets import MethodName
 from biresnerf.options.refine_options import parse_options
@@ -18,7 +20,8 @@ from biresnerf.result import Result, load
 from biresnerf.run.photos_added import joined_to
 from biresnerf.run.show_progress import ShownProgress
 from biresnerf.run.stop_request import StopRequest
-from biresnerf.write.output_folder import OutputFolder
+from biresnerf.stages import CHECKPOINT
+from biresnerf.write.output_folder import REPORT, OutputFolder
 
 if TYPE_CHECKING:
     from biresnerf.refinement.optimise.methods import Method
@@ -33,6 +36,7 @@ def refine(
     should_stop: Callable[[], bool] | None = None,
     overwrite: bool = False,
     fixed_from: str | Path | None = None,
+    parts: Sequence[str | Path] = (),
     method: MethodName | Method = "biresnerf",
     **options: Any,
 ) -> Result:
@@ -49,6 +53,8 @@ def refine(
         should_stop: called after every step, view, frame and photo; once true, a checkpoint and a partial result are
             written. Without it, Ctrl-C or a notebook's stop button does the same.
         fixed_from: a finished result of some of the photos: these keep its poses and lenses, and the others join them.
+        parts: results of parts of a large set, or folders of such: their poses and matches are joined, and all cameras
+            adjusted together.
         overwrite: remove a finished result from `output` first.
         method: the option of that name, or a method of your own (docs/method.md).
         options: of the refinement, by name, as docs/options.md lists them: ``preset="fast", steps=2000``.
@@ -69,6 +75,7 @@ def refine(
     folder = OutputFolder(Path(output))
     if not overwrite:
         folder.refuse_finished()
+    results = [result for part in parts for result in _results_in(Path(part))]
     with ExitStack() as during:
         on_progress = during.enter_context(ShownProgress()) if progress is True else progress or None
         stop = should_stop or during.enter_context(StopRequest(signal.SIGINT))
@@ -81,5 +88,24 @@ def refine(
 
         if overwrite:
             folder.remove_result()
-        refine_poses(dataset, output, asked, on_progress, stop, method=own)
+        refine_poses(dataset, output, asked, on_progress, stop, method=own, parts=results)
     return load(output)
+
+
+def _results_in(folder: Path) -> list[Path]:
+    """This finished result, or those in the folder, by name.
+
+    Raises:
+        InputError: ``result_missing`` where there is none, or one is not finished.
+    """
+    inside = sorted(one for one in folder.iterdir() if one.is_dir()) if folder.is_dir() else []
+    parts = [folder] if (folder / POSES).is_file() else inside
+    unfinished = [one for one in parts if not (one / REPORT).is_file() or (one / CHECKPOINT).is_file()]
+    if unfinished or not parts:
+        raise InputError(
+            "result_missing",
+            "is no finished result.",
+            where=str(unfinished[0] if unfinished else folder),
+            hint="Refine this part first, or name the results of the others one by one.",
+        )
+    return parts

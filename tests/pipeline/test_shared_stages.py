@@ -15,6 +15,7 @@ from biresnerf.errors import InputError
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.pipeline import refine_poses
 from biresnerf.progress import Progress
+from biresnerf.write.output_folder import OutputFolder
 
 pytestmark = pytest.mark.slow
 
@@ -34,7 +35,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def coarse(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What a finished run kept of its stage 1, as it said itself."""
     output, told = tmp_path_factory.mktemp("first") / "out", list[Progress]()
-    refine_poses(scene, output, OPTIONS, told.append, keep_reusable=True)
+    refine_poses(scene, OutputFolder(output, keep_reusable=True), OPTIONS, told.append)
     (said,) = [progress.reusable for progress in told if progress.reusable]
     assert set(said) == {"coarse"}, "COLMAP was not asked"
     (name,) = said["coarse"]

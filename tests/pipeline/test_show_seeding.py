@@ -50,7 +50,7 @@ def often(monkeypatch: pytest.MonkeyPatch):
 @needs_colmap
 def test_what_is_told_on_the_way_is_what_colmap_answers(photos: Path):
     told = []
-    mapping = remembered_mapping(read_dataset(photos), lambda: False, 0, "full", None, None, told.append)
+    mapping = remembered_mapping(read_dataset(photos), lambda: False, 0, "full", None, told.append)
     assert not told[0].features
     counts = [(len(found.features), len(found.matches)) for found in told]
     assert counts == sorted(counts)

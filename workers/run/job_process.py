@@ -120,6 +120,7 @@ def _refine(order: Order, options: RefineOptions, protocol: TextIO, stop: _Stop)
     from biresnerf.data.photos.video.video_frames import VideoReading
     from biresnerf.pipeline import refine_poses  # loads torch
     from biresnerf.run.photos_added import joined_to
+    from biresnerf.write.output_folder import OutputFolder
 
     source: Path | Dataset = order.input
     if order.result is not None:
@@ -135,12 +136,10 @@ def _refine(order: Order, options: RefineOptions, protocol: TextIO, stop: _Stop)
     try:
         refine_poses(
             source,
-            order.output,
+            OutputFolder(order.output, keep_reusable=True, title=order.title),
             options,
             on_progress=tell,
             should_stop=stop.asked.is_set,
-            keep_reusable=True,
-            title=order.title,
         )
     finally:
         _give_video_frames(order)

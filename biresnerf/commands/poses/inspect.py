@@ -53,7 +53,7 @@ def inspect_command(
 
     options, _ = resolve_here(asked)
     missing_names = sorted(name for name in set(options.fixed) if not dataset.called(name))
-    dataset = without_copies(without_photos(dataset, options.leave_out))
+    dataset = without_copies(without_photos(dataset, options.leave_out, options.photos))
     dataset = read_as(dataset, options.given_poses)
     if options.panoramas == "all":
         dataset = called_panoramas(dataset)

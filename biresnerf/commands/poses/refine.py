@@ -35,6 +35,10 @@ from biresnerf.viewer.report_html import REPORT_HTML
     "--fixed-from", type=click.Path(path_type=Path),
     help="A finished result of some of the photos: they keep its poses and lenses, and the others join its frame.",
 )  # fmt: skip
+@click.option(
+    "--join", "parts", multiple=True, type=click.Path(path_type=Path),
+    help="The result of a part of the photos (see `split`), or a folder of such; may be repeated. They are joined.",
+)  # fmt: skip
 @click.option("--overwrite", is_flag=True, help="Replace a finished result in OUT.")
 @click.option("--open", "open_report", is_flag=True, help="Open OUT/report.html in a browser at the end.")
 @click.option("--view", is_flag=True, help="Show the cameras in the browser while they move; needs viser.")
@@ -49,6 +53,7 @@ def refine_command(
     time_budget_s: float | None,
     settings: dict[str, Any],
     fixed_from: Path | None,
+    parts: tuple[Path, ...],
     overwrite: bool,
     open_report: bool,
     view: bool,
@@ -80,6 +85,7 @@ def refine_command(
                 should_stop=stop,
                 overwrite=overwrite,
                 fixed_from=fixed_from,
+                parts=parts,
                 **options,
             )
         except Interrupted as interrupted:

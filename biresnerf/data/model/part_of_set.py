@@ -15,38 +15,45 @@ from biresnerf.errors import InputError
 LEAST = 3  # photos of a usable set
 
 
-def without_photos(dataset: Dataset, names: Sequence[str]) -> Dataset:
-    """The set without the photos of these names, as the input writes them or by their path relative to its folder.
+def without_photos(dataset: Dataset, names: Sequence[str], only: Sequence[str] = ()) -> Dataset:
+    """The set without the photos of these names; of those in ``only`` alone, where it names any.
 
-    Lenses that no photo has any more go, too.
+    Names are as the input writes them, or paths relative to its folder. Lenses that no photo has any more go, too.
 
     Raises:
-        InputError: ``left_out_not_found``, or ``too_few_images``.
+        InputError: ``photos_not_found``, ``left_out_not_found``, or ``too_few_images``.
     """
-    if not names:
+    gone = _rows(dataset, names, "left_out_not_found", "leave_out")
+    if only:
+        gone |= set(range(len(dataset))) - _rows(dataset, only, "photos_not_found", "photos")
+    if not gone:
         return dataset
-    row_of = {name: rows[0] for name in names if (rows := dataset.called(name))}
-    unknown = [name for name in names if name not in row_of]
-    if unknown:
-        raise InputError(
-            "left_out_not_found",
-            f"there is no image {unknown[0]!r}.",
-            where="leave_out",
-            hint="Name images as the input does, or by their path relative to its folder.",
-        )
-    gone = {row_of[name] for name in names}
     kept = [frame for row, frame in enumerate(dataset.frames) if row not in gone]
     if len(kept) < LEAST:
         raise InputError(
             "too_few_images",
             f"{len(kept)} of {len(dataset)} images are left; at least {LEAST} are needed.",
-            where="leave_out",
-            hint="Leave out fewer.",
+            where="photos" if only else "leave_out",
+            hint="Name more photos." if only else "Leave out fewer.",
         )
     colmap = dataset.source.colmap
     if colmap is not None:
         colmap = without_images(colmap, {dataset.frames[row].name for row in gone})
     return with_frames(replace(dataset, source=replace(dataset.source, colmap=colmap)), kept)
+
+
+def _rows(dataset: Dataset, names: Sequence[str], code: str, where: str) -> set[int]:
+    """The rows of the photos of these names."""
+    row_of = {name: rows[0] for name in names if (rows := dataset.called(name))}
+    unknown = [name for name in names if name not in row_of]
+    if unknown:
+        raise InputError(
+            code,
+            f"there is no image {unknown[0]!r}.",
+            where=where,
+            hint="Name images as the input does, or by their path relative to its folder.",
+        )
+    return set(row_of.values())
 
 
 def with_frames(dataset: Dataset, frames: Sequence[Frame]) -> Dataset:

@@ -10,9 +10,10 @@ from typing import Any
 
 from biresnerf.data.model.atomic_file import write_text
 from biresnerf.data.model.dataset import Dataset
-from biresnerf.data.seeding.map_images import Mapping, ask_colmap, read_mapping
+from biresnerf.data.seeding.map_images import AskMatches, Mapping, ask_colmap, read_mapping
 from biresnerf.data.seeding.seeding_progress import OnSeeding, SeedingProgress
 from biresnerf.options.refine_options import SeedingEffort
+from biresnerf.uncertainty import PartsReport
 
 GUIDED_LIMIT_S, LIMIT_S = 900.0, 3600.0  # where all poses are given, and else
 MANY = 150  # photos; more have longer
@@ -23,11 +24,11 @@ def remembered_mapping(
     should_stop: Callable[[], bool],
     seed: int,
     effort: SeedingEffort,
-    limit_s: float | None,
     remember: Path | None,
     on_progress: OnSeeding,
+    ask: AskMatches | None = None,
 ) -> Mapping:
-    """What COLMAP finds, or found earlier for the same request if the file ``remember`` kept it.
+    """What COLMAP (or ``ask``) finds, or found earlier for the same request if the file ``remember`` kept it.
 
     An answer found with more effort than is now requested is as good.
 
@@ -41,11 +42,10 @@ def remembered_mapping(
     answer = _remembered(remember, keys)
     if answer is None:
         on_progress(SeedingProgress())
-        if limit_s is None:
-            limit_s = GUIDED_LIMIT_S if dataset.posed.all() else LIMIT_S
-            limit_s *= max(1.0, len(dataset) / MANY)
+        limit_s = GUIDED_LIMIT_S if dataset.posed.all() else LIMIT_S
+        limit_s *= max(1.0, len(dataset) / MANY)
         kept = None if remember is None else remember.with_name(f"features-{keys[0][:16]}.db")
-        answer = ask_colmap(
+        answer = (ask or ask_colmap)(
             dataset,
             should_stop=should_stop,
             seed=seed,
@@ -59,6 +59,14 @@ def remembered_mapping(
             write_text(remember, json.dumps({"key": keys[0], "answer": answer}))
             kept.unlink(missing_ok=True)
     return read_mapping(dataset, answer)
+
+
+def joined_parts(remembered: Path) -> PartsReport | None:
+    """How well the parts agree that an answer was joined from; None of COLMAP's own, or where there is none."""
+    if not remembered.is_file():
+        return None
+    parts = json.loads(remembered.read_text("utf-8"))["answer"].get("parts")
+    return None if parts is None else PartsReport.model_validate(parts)
 
 
 def _fingerprint(dataset: Dataset, seed: int) -> str:

@@ -14,7 +14,9 @@ from biresnerf.data.model.image_order import natural_order
 from biresnerf.geometry.level_ring import level_ring
 from biresnerf.report import PoseSource, TrialReport
 
-MATCHED_SOURCES: frozenset[PoseSource] = frozenset({"colmap", "matches-incremental", "matches-global"})
+MATCHED_SOURCES: frozenset[PoseSource] = frozenset(
+    {"colmap", "matches-incremental", "matches-global", "matches-parts"}
+)
 MOSTLY_MATCHED = 0.8  # share of the cameras from which on feature matches placed most
 DOUBTED = GUESSES | {"gimbal"}  # poses that need not agree with those of the other cameras
 GUESSED_MOST = 0.5  # of the cameras: with more guesses there is no field of others to agree with

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +61,7 @@ WIDEST_LOW, MOST_FEATURES_LOW = 800, 1024
 # from 400 px on they rarely gain anything. In px, of the long side and of all photos.
 THOROUGH_BELOW, THOROUGH_UP_TO = 400, 10e6
 
+PARTS = "parts"  # the mapper of a model that was joined from a set's parts
 COPY_EVERY_S = 60.0  # of features and matches, for a run that is killed
 _QUICKLY = 1  # PNG's compression of photos that are written for COLMAP, and removed after
 
@@ -70,7 +71,7 @@ class MappedModel:
     """The model that one way of mapping made of the images, in its own frame and scale.
 
     Attributes:
-        mapper: ``incremental`` or ``global``.
+        mapper: ``incremental``, ``global`` or ``parts``.
         rows: indices [m] of the images it places.
         world_from_cam: float64 [m, 4, 4].
         cameras: by index in the set, those that see any of them; known intrinsics as they were.
@@ -101,6 +102,23 @@ class Mapping:
     models: tuple[MappedModel, ...]
     matches: NDArray[np.int64]
     still: bool
+
+
+class AskMatches(Protocol):
+    """What answers as `ask_colmap` does: COLMAP itself, or what was found of a set's parts."""
+
+    def __call__(
+        self,
+        dataset: Dataset,
+        *,
+        should_stop: Callable[[], bool],
+        seed: int,
+        effort: SeedingEffort,
+        limit_s: float,
+        log_folder: Path | None,
+        kept: Path | None,
+        on_progress: OnSeeding,
+    ) -> dict[str, Any]: ...
 
 
 def known_intrinsics(dataset: Dataset) -> list[bool]:
@@ -158,7 +176,7 @@ def ask_colmap(
 
 def lay_out(dataset: Dataset, work: Path) -> dict[str, Any]:
     """The photos and masks in the folder ``work``, and what COLMAP may know of them: cameras, poses, pairs."""
-    names, masks = _numbered(dataset), work / "masks"
+    names, masks = numbered_names(dataset), work / "masks"
     _link_photos(dataset, names, work / "photos")
     return {
         "set": str(dataset.root),
@@ -169,7 +187,7 @@ def lay_out(dataset: Dataset, work: Path) -> dict[str, Any]:
     }
 
 
-def _numbered(dataset: Dataset) -> list[str]:
+def numbered_names(dataset: Dataset) -> list[str]:
     """COLMAP's list of pairs knows no spaces, so photos go by numbers there."""
     suffixes = (f.path.suffix if _as_it_is(dataset, i) else ".png" for i, f in enumerate(dataset.frames))
     return [f"{i:06}{suffix}" for i, suffix in enumerate(suffixes)]
@@ -271,18 +289,20 @@ def pair_count(dataset: Dataset, pairs: list[tuple[str, str]] | None) -> int:
 
 def _pairs(dataset: Dataset, names: list[str]) -> list[tuple[str, str]] | None:
     """The pairs worth matching, None for all of them."""
+    if len(names) <= (GUIDED_ALL_PAIRS_UP_TO if dataset.posed.all() else ALL_PAIRS_UP_TO):
+        return None
+    return [(names[i], names[j]) for i, j in sorted(likely_pairs(dataset))]
+
+
+def likely_pairs(dataset: Dataset) -> set[tuple[int, int]]:
+    """Pairs of photos, by row, that may show the same: by given poses where all have one, else by looks and names."""
     if dataset.posed.all():
-        if len(names) <= GUIDED_ALL_PAIRS_UP_TO:
-            return None
-        pairs = nearest_pairs(pose_distances(dataset.world_from_cam), NEIGHBOURS)
-    else:
-        if len(names) <= ALL_PAIRS_UP_TO:
-            return None
-        pairs = nearest_pairs(-likeness(dataset).astype(np.float64), BY_LIKENESS)
-        order = natural_order(dataset.names)
-        for step in range(1, BY_NAME + 1):
-            pairs |= {(min(a, b), max(a, b)) for a, b in zip(order, order[step:], strict=False)}
-    return [(names[i], names[j]) for i, j in sorted(pairs)]
+        return nearest_pairs(pose_distances(dataset.world_from_cam), NEIGHBOURS)
+    pairs = nearest_pairs(-likeness(dataset).astype(np.float64), BY_LIKENESS)
+    order = natural_order(dataset.names)
+    for step in range(1, BY_NAME + 1):
+        pairs |= {(min(a, b), max(a, b)) for a, b in zip(order, order[step:], strict=False)}
+    return pairs
 
 
 def nearest_pairs(apart: NDArray[np.float64], count: int) -> set[tuple[int, int]]:
@@ -299,7 +319,7 @@ def read_mapping(dataset: Dataset, answer: dict[str, Any]) -> Mapping:
     On lego with noisy poses (200 px) both ways of mapping place all; global mapping explains more features, with 1.5
     times the error, and its poses are off by 1.5 times as much.
     """
-    index = {name: i for i, name in enumerate(_numbered(dataset))}
+    index = {name: i for i, name in enumerate(numbered_names(dataset))}
     models = [_model(model, index) for model in answer["models"]]
     matches = np.zeros((len(dataset), len(dataset)), dtype=np.int64)
     for a, b, count in answer["matches"]:

@@ -22,6 +22,8 @@ from biresnerf.data.photos.photo_folders import few_names
 from biresnerf.data.seeding.cached_mapping import remembered_mapping
 from biresnerf.data.seeding.initial_poses import InitialPoses, even_ring
 from biresnerf.data.seeding.map_images import (
+    PARTS,
+    AskMatches,
     MappedModel,
     Mapping,
     adds_to,
@@ -52,7 +54,9 @@ STILL = (
 )
 # Median likeness of all pairs of photos: from nearly one place 0.56 (LLFF's horns) to 0.87, around a scene 0.1 to 0.66.
 FACING_ALIKE = 0.4
-MATCHED: dict[str, PoseSource] = {"incremental": "matches-incremental", "global": "matches-global"}
+MATCHED: dict[str, PoseSource] = {
+    "incremental": "matches-incremental", "global": "matches-global", PARTS: "matches-parts",
+}  # fmt: skip
 BY_GIMBAL = (
     "the cameras begin where GPS and the angles of the drone's gimbal say that they are. How far these are off is not "
     "known, nor how the camera is mounted."
@@ -134,10 +138,10 @@ def seed_poses(
     should_stop: Callable[[], bool] = lambda: False,
     seed: int = 0,
     effort: SeedingEffort = "full",
-    limit_s: float | None = None,
     remember: Path | None = None,
     on_progress: OnSeeding = lambda _found: None,
     takes_back_offset: bool = True,
+    ask: AskMatches | None = None,
 ) -> Seeding:
     """The set with a pose for every image, and the sets of poses worth starting from.
 
@@ -151,7 +155,7 @@ def seed_poses(
     COLMAP's threads make its answer differ a little from run to run. A run that is to be continued keeps it in the
     file ``remember``, with colmap.log beside it. ``on_progress`` is called only if
     COLMAP does run: at once, then when more is known. An offset that all given poses share on the camera's side is
-    removed first, unless they must not change (``takes_back_offset``).
+    removed first, unless they must not change (``takes_back_offset``). ``ask`` answers in COLMAP's place.
 
     Raises:
         InputError: ``pose_missing``, ``colmap_missing``, ``seed_failed``, ``insufficient_overlap`` or ``seed_timeout``.
@@ -167,14 +171,14 @@ def seed_poses(
         return _seeding(dataset, _without_features(given))
     if start == "turntable":
         return _seeding(dataset, even_ring(dataset))
-    if not can_match():
+    if ask is None and not can_match():
         return _without_colmap(given, start)
     try:
         mapping = remembered_mapping(
             replace(dataset, frames=tuple(replace(f, world_from_cam=None) for f in dataset.frames))
             if start == "colmap"
             else dataset,
-            should_stop, seed, effort, limit_s, remember, on_progress,
+            should_stop, seed, effort, remember, on_progress, ask,
         )  # fmt: skip
     except InputError as error:
         if start == "colmap" or not given.posed.any():

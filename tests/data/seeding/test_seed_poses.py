@@ -16,6 +16,7 @@ from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.formats.transforms.write_transforms import write_transforms
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.seeding import colmap_process
+from biresnerf.data.seeding.map_images import ask_colmap
 from biresnerf.data.seeding.seed_poses import seed_poses
 from biresnerf.data.synthetic.camera_photos import MAKERS, stored_poses
 from biresnerf.data.synthetic.scene import synthetic_focal
@@ -163,7 +164,7 @@ def test_a_wish_to_stop_ends_the_child_at_once(folder):
 @needs_colmap
 def test_the_time_limit_ends_the_child(folder):
     with pytest.raises(InputError) as caught:
-        seeded(folder, limit_s=0.3)
+        seeded(folder, ask=lambda dataset, **how: ask_colmap(dataset, **{**how, "limit_s": 0.3}))
     assert_complete(caught.value, "seed_timeout", folder.name)
 
 

@@ -78,7 +78,7 @@ def test_an_answer_found_with_more_effort_is_not_asked_for_again_and_one_with_le
         """Whether COLMAP was asked."""
         before = len(asked)
         try:
-            remembered_mapping(dataset, lambda: False, 0, effort, None, kept, lambda _: None)
+            remembered_mapping(dataset, lambda: False, 0, effort, kept, lambda _: None)
         except Interrupted:
             return len(asked) > before
         return False
@@ -89,7 +89,7 @@ def test_an_answer_found_with_more_effort_is_not_asked_for_again_and_one_with_le
             patched.setattr(map_images, "run_colmap", lambda *_: answer)
             patched.setattr(map_images, "keep_tracks", lambda *_: None)
             kept.unlink(missing_ok=True)
-            remembered_mapping(dataset, lambda: False, 0, effort, None, kept, lambda _: None)
+            remembered_mapping(dataset, lambda: False, 0, effort, kept, lambda _: None)
 
     with pytest.MonkeyPatch.context() as monkeypatch:
         keep_as("full", monkeypatch)

@@ -1,0 +1,250 @@
+"""Join the results of a set's parts to one answer about all of it, in COLMAP's place; and how well the parts agree."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from biresnerf.data.formats.result_formats import read_result
+from biresnerf.data.model.atomic_file import whole_file
+from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.model.refined_set import RefinedSet
+from biresnerf.data.points.tracks import KEPT, Tracks
+from biresnerf.data.seeding.colmap_tracks import most_observations
+from biresnerf.data.seeding.map_images import PARTS, MappedModel, numbered_names
+from biresnerf.data.seeding.match_poses import JUDGED_FROM, carry_model
+from biresnerf.errors import InputError
+from biresnerf.geometry.camera.camera_models import Camera
+from biresnerf.geometry.pose_error import rotation_between_deg
+from biresnerf.geometry.rigid import rigid_inverse
+from biresnerf.geometry.similarity import align_robust
+from biresnerf.uncertainty import PartReport, PartsReport, SeamReport
+
+FEW = f"it shares fewer than {JUDGED_FROM} photos with the others"
+APART = "too many of the photos that it shares have other poses there"
+NOTHING = "its photos matched nothing"
+
+
+@dataclass(frozen=True, eq=False)
+class PartResult:
+    """What was found of a part.
+
+    Attributes:
+        name: of the part.
+        model: its poses in its own frame, by rows of the whole set, and its lenses by the whole set's cameras.
+        bounds: of each pose, rad and units of the part, [m, 2]: 90 of 100 errors are within; NaN where not known.
+        tracks: its points, by rows of the whole set; None where nothing matched.
+    """
+
+    name: str
+    model: MappedModel
+    bounds: NDArray[np.float64]
+    tracks: Tracks | None
+
+
+def read_part(dataset: Dataset, folder: Path) -> PartResult:
+    """The result in ``folder`` of some of the set's photos.
+
+    Raises:
+        InputError: ``result_missing``, ``part_of_other_set``, or a code of the readers.
+    """
+    found = read_result(folder)
+    rows = [dataset.called(image.name)[:1] for image in found.images]
+    if not all(rows):
+        name = next(image.name for image, row in zip(found.images, rows, strict=True) if not row)
+        raise InputError(
+            "part_of_other_set", f"has an image {name!r}, which the set lacks.", where=str(folder),
+            hint="Give results of photos of this set.",
+        )  # fmt: skip
+    row_of = np.array([row[0] for row in rows], np.int64)
+    images = zip(row_of.tolist(), found.images, strict=True)
+    lenses = {dataset.frames[row].camera: found.cameras[image.camera] for row, image in images}
+    tracks, points = _tracks(found, row_of), found.model.points
+    errors = points.errors[points.errors >= 0]
+    model = MappedModel(
+        PARTS, row_of, np.stack([image.world_from_cam for image in found.images]), lenses,
+        len(points), len(points.track_image_ids), float(errors.mean()) if len(errors) else 0.0,
+    )  # fmt: skip
+    known = [image.uncertainty for image in found.images]
+    bounds = [
+        (np.nan, np.nan) if one is None or one.rotation_deg is None or one.position is None
+        else (np.radians(one.rotation_deg), one.position)
+        for one in known
+    ]  # fmt: skip
+    return PartResult(folder.name, model, np.array(bounds), tracks)
+
+
+def _tracks(found: RefinedSet, row_of: NDArray[np.int64]) -> Tracks | None:
+    """The points that features of the photos show."""
+    points, row_of_id = found.model.points, dict(zip(found.image_ids, row_of.tolist(), strict=True))
+    if found.points_source not in ("features", "tracks") or not len(points):
+        return None
+    image = np.array([row_of_id[number] for number in points.track_image_ids.tolist()], np.int64)
+    xy = np.stack([
+        found.model.images[number].points2d_px[feature]
+        for number, feature in zip(
+            points.track_image_ids.tolist(), points.track_point2d_indices.tolist(), strict=True
+        )
+    ])  # fmt: skip
+    order = np.lexsort((image, points.owner))
+    return Tracks.of(points.owner[order], image[order], xy[order])
+
+
+@dataclass(frozen=True)
+class AskParts:
+    """Answers about a set as COLMAP does, from the results in these folders, each of a part of it."""
+
+    folders: tuple[Path, ...]
+
+    def __call__(self, dataset: Dataset, *, log_folder: Path | None, **_: Any) -> dict[str, Any]:
+        """As `biresnerf.data.seeding.map_images.ask_colmap`.
+
+        Raises:
+            InputError: a code of `read_part`.
+        """
+        parts = [read_part(dataset, folder) for folder in self.folders]
+        model, report = join(dataset, parts)
+        tracks = joined_tracks([part.tracks for part in parts], len(dataset))
+        if tracks is not None and log_folder is not None:
+            log_folder.mkdir(parents=True, exist_ok=True)
+            with whole_file(log_folder / KEPT) as temporary:
+                arrays: dict[str, Any] = tracks.kept()
+                np.savez(temporary, names=np.array(dataset.names), **arrays)
+        names = numbered_names(dataset)
+        return {
+            "models": [_answer(model, names)] if len(model.rows) else [],
+            "matches": [(names[a], names[b], n) for a, b, n in _matches(tracks)],
+            "parts": report.model_dump(),
+        }
+
+
+def joined_tracks(tracks: Sequence[Tracks | None], images: int) -> Tracks | None:
+    """The tracks of all parts: points that share a feature of a photo are one."""
+    pairs = [(one, one.pairs()) for one in tracks if one is not None]
+    if not pairs:
+        return None
+    joined = Tracks.of_matches(
+        np.concatenate([np.column_stack([one.image[a], one.image[b]]) for one, (a, b) in pairs]),
+        np.concatenate([np.stack([one.xy[a], one.xy[b]], axis=1) for one, (a, b) in pairs]),
+    )
+    return None if joined is None else joined.thinned(most_observations(images), images)
+
+
+def join(dataset: Dataset, parts: Sequence[PartResult]) -> tuple[MappedModel, PartsReport]:
+    """One model of all parts that join, in the frame of the largest, and how well any two of them agree.
+
+    The part that shares the most photos with those before it is carried onto them by these photos, robustly. It is not
+    forced: where too many of them disagree, or too few are shared, the part stays out. Of a photo in several parts the
+    pose with the smaller bound is taken.
+    """
+    n = len(dataset)
+    poses, placed = np.tile(np.eye(4), (n, 1, 1)), np.zeros(n, np.bool_)
+    bound, in_part = np.full(n, np.inf), np.array([np.isin(np.arange(n), part.model.rows) for part in parts])
+    reasons: dict[int, str] = {k: NOTHING for k, part in enumerate(parts) if part.tracks is None}
+    left = [k for k in range(len(parts)) if k not in reasons]
+    joined: list[int] = []
+    while left:
+        part = max(left, key=lambda k: ((in_part[k] & placed).sum(), in_part[k].sum(), -k))
+        left.remove(part)
+        model = parts[part].model
+        if joined and (in_part[part] & placed).sum() < JUDGED_FROM:
+            reasons[part] = FEW
+            continue
+        carried = carry_model(model, poses, placed) if joined else None
+        if joined and carried is None:
+            reasons[part] = APART
+            continue
+        found = poses.copy() if carried is None else carried.world_from_cam
+        rows = model.rows if carried is None else model.rows[carried.placed[model.rows]]
+        if carried is None:
+            found[rows] = model.world_from_cam
+        known = np.full(n, np.inf)
+        known[model.rows] = np.where(np.isfinite(parts[part].bounds[:, 0]), parts[part].bounds[:, 0], np.inf)
+        taken = rows[~placed[rows] | (known[rows] < bound[rows])]
+        poses[taken], placed[taken], bound[taken] = found[taken], True, known[taken]
+        joined.append(part)
+    seams = [
+        _seam(parts[a], parts[b]) for a, b in combinations(sorted(joined), 2)
+        if (in_part[a] & in_part[b]).sum() >= JUDGED_FROM
+    ]  # fmt: skip
+    report = PartsReport(
+        parts=tuple(
+            PartReport(name=part.name, photos=len(part.model.rows), why_not=reasons.get(k))
+            for k, part in enumerate(parts)
+        ),
+        seams=tuple(seams),
+        photos_left_out=int(n - placed.sum()),
+    )
+    return _one_model(poses, placed, [parts[k].model for k in joined]), report
+
+
+def _one_model(
+    poses: NDArray[np.float64], placed: NDArray[np.bool_], models: Sequence[MappedModel]
+) -> MappedModel:
+    """The joined model; of a lens that several parts found, the one of the part with the most photos."""
+    lenses: dict[int, Camera] = {}
+    for model in sorted(models, key=lambda one: len(one.rows)):
+        lenses |= model.cameras
+    seen = sum(model.observations for model in models)
+    error = sum(model.reprojection_px * model.observations for model in models) / max(1, seen)
+    points = sum(model.points for model in models)
+    return MappedModel(PARTS, np.flatnonzero(placed), poses[placed], lenses, points, seen, error)
+
+
+def _seam(a: PartResult, b: PartResult) -> SeamReport:
+    """How far two parts disagree on the photos that both have, once one is carried onto the other by them."""
+    _, in_a, in_b = np.intersect1d(a.model.rows, b.model.rows, return_indices=True)
+    there, here = a.model.world_from_cam[in_a], b.model.world_from_cam[in_b]
+    a_from_b = align_robust(here, there, with_rotations=True)
+    here = a_from_b.apply_to_poses(here)
+    turned = rotation_between_deg(here, there)
+    shifted = np.linalg.norm(here[:, :3, 3] - there[:, :3, 3], axis=1)
+    bounds = np.hypot(a.bounds[in_a], b.bounds[in_b] * [1.0, a_from_b.scale])
+    known = np.isfinite(bounds).all(1)
+    within = (np.radians(turned) <= bounds[:, 0]) & (shifted <= bounds[:, 1])
+    return SeamReport(
+        parts=(a.name, b.name),
+        photos=len(in_a),
+        rotation_deg=float(np.median(turned)),
+        rotation_deg_worst=float(turned.max()),
+        position=float(np.median(shifted)),
+        position_worst=float(shifted.max()),
+        within=float(within[known].mean()) if known.any() else None,
+    )
+
+
+def _matches(tracks: Tracks | None) -> list[tuple[int, int, int]]:
+    """How many points any two photos, by row, have in common."""
+    if tracks is None:
+        return []
+    ends = np.cumsum(tracks.lengths)
+    pairs = [
+        pair for start, end in zip(np.concatenate(([0], ends[:-1])).tolist(), ends.tolist(), strict=True)
+        for pair in combinations(tracks.image[start:end].tolist(), 2)
+    ]  # fmt: skip
+    found, counts = np.unique(np.array(pairs), axis=0, return_counts=True)
+    return [(a, b, n) for (a, b), n in zip(found.tolist(), counts.tolist(), strict=True)]
+
+
+def _answer(model: MappedModel, names: Sequence[str]) -> dict[str, Any]:
+    """The model as COLMAP's child process writes it."""
+    return {
+        "mapper": model.mapper,
+        "images": [
+            {"name": names[row], "cam_from_world": pose[:3].tolist()}
+            for row, pose in zip(model.rows.tolist(), rigid_inverse(model.world_from_cam), strict=True)
+        ],
+        "cameras": {
+            str(number): {"model": lens.model, "width": lens.width, "height": lens.height, "params": list(lens.params)}
+            for number, lens in model.cameras.items()
+        },
+        "points": model.points,
+        "observations": model.observations,
+        "reprojection_px": model.reprojection_px,
+    }  # fmt: skip
