@@ -72,11 +72,6 @@ def _metis(weights: list[dict[int, int]], count: int) -> NDArray[np.int64]:
             where="pymetis",
             hint='Run `pip install "biresnerf[colmap]"`.',
         ) from error
-    starts = np.cumsum([0, *(len(row) for row in weights)]).tolist()
-    found = pymetis.part_graph(
-        count,
-        xadj=starts,
-        adjncy=[other for row in weights for other in row],
-        eweights=[weight for row in weights for weight in row.values()],
-    )
-    return np.array(found[1], np.int64)
+    near = [list(row) for row in weights]
+    of_pairs = [weight for row in weights for weight in row.values()]
+    return np.array(pymetis.part_graph(count, adjacency=near, eweights=of_pairs)[1], np.int64)

@@ -17,8 +17,8 @@ from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.points.tracks import KEPT, Tracks
 from biresnerf.data.seeding.colmap_tracks import most_observations
-from biresnerf.data.seeding.map_images import PARTS, MappedModel, numbered_names
-from biresnerf.data.seeding.match_poses import JUDGED_FROM, carry_model
+from biresnerf.data.seeding.map_images import PARTS, SAME_DEG, MappedModel, numbered_names
+from biresnerf.data.seeding.match_poses import JUDGED_FROM, MatchedPoses, carry_model
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.pose_error import rotation_between_deg
@@ -27,7 +27,7 @@ from biresnerf.geometry.similarity import align_robust
 from biresnerf.uncertainty import PartReport, PartsReport, SeamReport
 
 FEW = f"it shares fewer than {JUDGED_FROM} photos with the others"
-APART = "too many of the photos that it shares have other poses there"
+APART = "photos that it shares with the others have other poses there"
 NOTHING = "its photos matched nothing"
 
 
@@ -109,7 +109,7 @@ class AskParts:
             InputError: a code of `read_part`.
         """
         parts = [read_part(dataset, folder) for folder in self.folders]
-        model, report = join(dataset, parts)
+        model, report = join(len(dataset), parts)
         tracks = joined_tracks([part.tracks for part in parts], len(dataset))
         if tracks is not None and log_folder is not None:
             log_folder.mkdir(parents=True, exist_ok=True)
@@ -136,14 +136,14 @@ def joined_tracks(tracks: Sequence[Tracks | None], images: int) -> Tracks | None
     return None if joined is None else joined.thinned(most_observations(images), images)
 
 
-def join(dataset: Dataset, parts: Sequence[PartResult]) -> tuple[MappedModel, PartsReport]:
+def join(photos: int, parts: Sequence[PartResult]) -> tuple[MappedModel, PartsReport]:
     """One model of all parts that join, in the frame of the largest, and how well any two of them agree.
 
     The part that shares the most photos with those before it is carried onto them by these photos, robustly. It is not
     forced: where too many of them disagree, or too few are shared, the part stays out. Of a photo in several parts the
     pose with the smaller bound is taken.
     """
-    n = len(dataset)
+    n = photos
     poses, placed = np.tile(np.eye(4), (n, 1, 1)), np.zeros(n, np.bool_)
     bound, in_part = np.full(n, np.inf), np.array([np.isin(np.arange(n), part.model.rows) for part in parts])
     reasons: dict[int, str] = {k: NOTHING for k, part in enumerate(parts) if part.tracks is None}
@@ -157,7 +157,9 @@ def join(dataset: Dataset, parts: Sequence[PartResult]) -> tuple[MappedModel, Pa
             reasons[part] = FEW
             continue
         carried = carry_model(model, poses, placed) if joined else None
-        if joined and carried is None:
+        if joined and (
+            carried is None or _apart_deg(carried, poses, model.rows[placed[model.rows]]) > SAME_DEG
+        ):
             reasons[part] = APART
             continue
         found = poses.copy() if carried is None else carried.world_from_cam
@@ -182,6 +184,11 @@ def join(dataset: Dataset, parts: Sequence[PartResult]) -> tuple[MappedModel, Pa
         photos_left_out=int(n - placed.sum()),
     )
     return _one_model(poses, placed, [parts[k].model for k in joined]), report
+
+
+def _apart_deg(carried: MatchedPoses, poses: NDArray[np.float64], shared: NDArray[np.int64]) -> float:
+    """By how much the photos that a part shares are turned there against what was joined before: the median."""
+    return float(np.median(rotation_between_deg(carried.world_from_cam[shared], poses[shared])))
 
 
 def _one_model(

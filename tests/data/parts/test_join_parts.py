@@ -1,0 +1,143 @@
+"""Parts are joined by the photos that they share; what does not fit stays out and is named; seams are measured."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from biresnerf.data.parts.join_parts import APART, FEW, NOTHING, PartResult, join, joined_tracks
+from biresnerf.data.points.tracks import Tracks
+from biresnerf.data.seeding.map_images import PARTS, MappedModel
+from biresnerf.geometry.camera.camera_models import Camera
+from biresnerf.geometry.pose_error import camera_errors
+from biresnerf.geometry.rigid import rotation_of
+from biresnerf.geometry.similarity import Similarity, align_by_spread
+
+COUNT = 40
+LENS = Camera("PINHOLE", 20, 16, (18.0, 18.0, 10.0, 8.0))
+
+
+@pytest.fixture(scope="module")
+def truth() -> NDArray[np.float64]:
+    """World_from_cam of cameras around a point, each looking at it."""
+    angles = np.linspace(0, 2 * np.pi, COUNT, endpoint=False)
+    poses = np.tile(np.eye(4), (COUNT, 1, 1))
+    poses[:, :3, :3] = Rotation.from_rotvec(angles[:, None] * [0.0, 1, 0]).as_matrix()
+    poses[:, :3, 3] = -4 * poses[:, :3, 2] + np.random.default_rng(2).normal(0, 0.2, (COUNT, 3))
+    return poses
+
+
+def part(
+    name: str, rows: NDArray[np.int64], poses: NDArray[np.float64], bound: float = np.nan, tracks: bool = True
+) -> PartResult:
+    model = MappedModel(PARTS, rows, poses, {0: LENS}, 100, 500, 0.4)
+    points = np.repeat(np.arange(5), 2)
+    found = Tracks.of(points, np.tile(rows[:2], 5), np.arange(20.0).reshape(10, 2)) if tracks else None
+    return PartResult(name, model, np.full((len(rows), 2), bound), found)
+
+
+def in_own_frame(poses: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
+    rng = np.random.default_rng(seed)
+    turn = Rotation.random(random_state=seed).as_matrix()
+    return np.asarray(Similarity(float(rng.uniform(0.5, 2)), turn, rng.normal(0, 5, 3)).apply_to_poses(poses))
+
+
+def test_parts_in_frames_of_their_own_become_one_rig(truth: NDArray[np.float64]) -> None:
+    rows = [np.arange(0, 18), np.arange(12, 30), np.arange(24, COUNT)]
+    parts = [part(f"part-{k}", some, in_own_frame(truth[some], k)) for k, some in enumerate(rows)]
+    model, report = join(COUNT, parts)
+    np.testing.assert_array_equal(model.rows, np.arange(COUNT))
+    errors = camera_errors(
+        align_by_spread(model.world_from_cam, truth).apply_to_poses(model.world_from_cam), truth
+    )
+    assert errors.rotation_deg.max() < 1e-6
+    assert errors.centre.max() < 1e-7
+    assert [one.why_not for one in report.parts] == [None] * 3
+    assert report.photos_left_out == 0
+    assert {seam.parts: seam.photos for seam in report.seams} == {
+        ("part-0", "part-1"): 6,
+        ("part-1", "part-2"): 6,
+    }
+
+
+def test_a_part_that_contradicts_the_others_or_shares_too_little_stays_out(
+    truth: NDArray[np.float64],
+) -> None:
+    scattered = truth[12:24].copy()
+    scattered[:, :3, :3] = Rotation.random(12, random_state=1).as_matrix()
+    parts = [
+        part("good", np.arange(0, 20), truth[:20]),
+        part("wrong", np.arange(12, 24), scattered),
+        part("far", np.arange(18, 30), truth[18:30]),
+        part("empty", np.arange(0, 10), truth[:10], tracks=False),
+    ]
+    model, report = join(COUNT, parts)
+    assert {one.name: one.why_not for one in report.parts} == {
+        "good": None, "wrong": APART, "far": FEW, "empty": NOTHING,
+    }  # fmt: skip
+    np.testing.assert_array_equal(model.rows, np.arange(20))
+    assert report.photos_left_out == 20
+
+
+def test_of_a_shared_photo_the_pose_with_the_smaller_bound_is_taken(truth: NDArray[np.float64]) -> None:
+    rough = truth[:24].copy()
+    rough[:, :3, :3] = rotation_of(np.random.default_rng(0).normal(0, 0.01, (24, 3))) @ rough[:, :3, :3]
+    parts = [part("rough", np.arange(24), rough, 0.02), part("fine", np.arange(12, 30), truth[12:30], 0.001)]
+    model, _ = join(COUNT, parts)
+    found = model.world_from_cam[:, :3, :3]
+    relative = np.swapaxes(found[12:29], 1, 2) @ found[13:30]
+    expected = np.swapaxes(truth[12:29, :3, :3], 1, 2) @ truth[13:30, :3, :3]
+    np.testing.assert_allclose(relative, expected, atol=1e-9)
+
+
+def test_seams_measure_the_noise_of_parts_and_hold_where_bounds_are_honest(
+    truth: NDArray[np.float64],
+) -> None:
+    rng, noise = np.random.default_rng(3), 0.002
+    # The length of three normal deviates is below 2.5 of them nine times in ten.
+    bound = 2.5 * noise
+
+    def noisy() -> NDArray[np.float64]:
+        poses = truth.copy()
+        poses[:, :3, :3] = rotation_of(rng.normal(0, noise, (COUNT, 3))) @ poses[:, :3, :3]
+        poses[:, :3, 3] += rng.normal(0, noise, (COUNT, 3))
+        return poses
+
+    everything = np.arange(COUNT)
+    shares = []
+    for _ in range(10):
+        _, report = join(
+            COUNT, [part("a", everything, noisy(), bound), part("b", everything, noisy(), bound)]
+        )
+        (seam,) = report.seams
+        # The median length of three deviates of sqrt(2) times the noise: 1.538 of them.
+        assert seam.rotation_deg == pytest.approx(np.degrees(1.538 * np.sqrt(2) * noise), rel=0.35)
+        assert seam.position == pytest.approx(1.538 * np.sqrt(2) * noise, rel=0.35)
+        assert seam.within is not None
+        shares.append(seam.within)
+    assert 0.7 < np.mean(shares) < 0.95  # rotation and position both: 0.81
+
+
+def test_points_that_share_a_feature_of_a_photo_are_one_point() -> None:
+    a = Tracks.of(
+        np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1]), np.array([[1.0, 1], [2, 2], [5, 5], [6, 6]])
+    )
+    b = Tracks.of(
+        np.array([0, 0, 1, 1]), np.array([1, 2, 1, 2]), np.array([[2.0, 2], [3, 3], [8, 8], [9, 9]])
+    )
+    joined = joined_tracks([a, None, b], 3)
+    assert joined is not None
+    seen = {
+        tuple(
+            zip(
+                joined.image[joined.point == k].tolist(),
+                joined.xy[joined.point == k, 0].tolist(),
+                strict=True,
+            )
+        )
+        for k in range(joined.points)
+    }
+    assert seen == {((0, 1.0), (1, 2.0), (2, 3.0)), ((0, 5.0), (1, 6.0)), ((1, 8.0), (2, 9.0))}
+    assert joined_tracks([None], 3) is None
