@@ -148,7 +148,9 @@ def _refine(input: str | Path | Dataset, setup: _Setup, observer: Observer, star
         """The report, after the result."""
         renderer, recipe, at = optimiser.renderer, optimiser.recipe, optimiser.step_state()
         report = run_report(scene, renderer, recipe, at, run.record, stages.repair.repaired, found)
-        report = report.model_copy(update={"parts": joined_parts(setup.folder.path / SEEDING)})
+        if (parts := joined_parts(setup.folder.path / SEEDING)) is not None:
+            doubts = (*report.warnings, *parts.doubts())
+            report = report.model_copy(update={"parts": parts, "warnings": doubts})
         return write_result(
             setup.folder, scene, renderer.joint, setup.monitor, evaluation, report, found.so_far
         )

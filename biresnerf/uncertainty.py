@@ -148,7 +148,7 @@ class SeamReport(FrozenModel, allow_inf_nan=False):
         None,
         examples=[0.95],
         description="Share of the photos on which the parts disagree by no more than their bounds for nine in ten "
-        "errors allow. None where no bounds are known.",
+        "errors allow, the mean of rotations and positions. None where no bounds are known.",
     )
 
 
@@ -158,6 +158,19 @@ class PartsReport(FrozenModel):
     parts: tuple[PartReport, ...]
     seams: tuple[SeamReport, ...] = ()
     photos_left_out: int = Field(0, description="Which no part that joined has placed.")
+
+    def doubts(self) -> tuple[str, ...]:
+        """What did not join, and seams at which most photos disagree by more than the parts' bounds allow."""
+        out = [f"{one.name} was not joined: {one.why_not}." for one in self.parts if one.why_not]
+        if self.photos_left_out:
+            out.append(f"{self.photos_left_out} photos were placed by no part that joined.")
+        out += [
+            f"{one.parts[0]} and {one.parts[1]} disagree by {one.rotation_deg:.2g}° (median) on the {one.photos} photos "
+            "that both have, more than their bounds allow."
+            for one in self.seams
+            if one.within is not None and one.within < 0.5
+        ]
+        return tuple(out)
 
 
 class InputAccuracy(FrozenModel):

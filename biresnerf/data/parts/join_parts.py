@@ -214,7 +214,7 @@ def _seam(a: PartResult, b: PartResult) -> SeamReport:
     shifted = np.linalg.norm(here[:, :3, 3] - there[:, :3, 3], axis=1)
     bounds = np.hypot(a.bounds[in_a], b.bounds[in_b] * [1.0, a_from_b.scale])
     known = np.isfinite(bounds).all(1)
-    within = (np.radians(turned) <= bounds[:, 0]) & (shifted <= bounds[:, 1])
+    within = np.column_stack([np.radians(turned), shifted]) <= bounds
     return SeamReport(
         parts=(a.name, b.name),
         photos=len(in_a),

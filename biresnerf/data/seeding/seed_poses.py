@@ -181,7 +181,7 @@ def seed_poses(
             should_stop, seed, effort, remember, on_progress, ask,
         )  # fmt: skip
     except InputError as error:
-        if start == "colmap" or not given.posed.any():
+        if ask is not None or start == "colmap" or not given.posed.any():
             raise
         warning = f"The given poses could not be compared with feature matches: {error}"
         noted = replace(dataset, warnings=(*dataset.warnings, warning))

@@ -30,6 +30,11 @@ def test_what_is_left_keeps_its_poses_lenses_and_model(tmp_path: Path) -> None:
     np.testing.assert_array_equal(part.world_from_cam, whole.world_from_cam[[0, 2, 3]])
     assert part.source.colmap is not None
     assert {image.name for image in part.source.colmap.images.values()} == set(part.names)
+    assert without_photos(both, (), only=part.names).names == part.names
+    assert without_photos(both, part.names[:1], only=whole.names).names == (
+        *whole.names[1:2],
+        *part.names[1:],
+    )
     last = without_photos(both, [whole.names[0]])
     assert [frame.camera for frame in last.frames] == [0, 1, 1]
 
@@ -44,5 +49,10 @@ def test_a_name_of_no_photo_and_too_few_photos_are_refused(tmp_path: Path) -> No
         with pytest.raises(InputError) as caught:
             without_photos(whole, names)
         assert (caught.value.code, caught.value.where) == (code, "leave_out")
+        assert caught.value.hint
+    for only, code in ((["nosuch.png"], "photos_not_found"), (list(whole.names[:2]), "too_few_images")):
+        with pytest.raises(InputError) as caught:
+            without_photos(whole, (), only)
+        assert (caught.value.code, caught.value.where) == (code, "photos")
         assert caught.value.hint
     assert without_photos(whole, []) is whole

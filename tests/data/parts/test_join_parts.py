@@ -79,6 +79,8 @@ def test_a_part_that_contradicts_the_others_or_shares_too_little_stays_out(
     }  # fmt: skip
     np.testing.assert_array_equal(model.rows, np.arange(20))
     assert report.photos_left_out == 20
+    assert len(report.doubts()) == 4
+    assert "far" in report.doubts()[1]
 
 
 def test_of_a_shared_photo_the_pose_with_the_smaller_bound_is_taken(truth: NDArray[np.float64]) -> None:
@@ -117,7 +119,15 @@ def test_seams_measure_the_noise_of_parts_and_hold_where_bounds_are_honest(
         assert seam.position == pytest.approx(1.538 * np.sqrt(2) * noise, rel=0.35)
         assert seam.within is not None
         shares.append(seam.within)
-    assert 0.7 < np.mean(shares) < 0.95  # rotation and position both: 0.81
+    assert 0.8 < np.mean(shares) < 0.98
+
+
+def test_parts_that_disagree_by_more_than_they_state_are_doubted(truth: NDArray[np.float64]) -> None:
+    rows, bent = np.arange(COUNT), truth.copy()
+    bent[:, :3, :3] = rotation_of(np.random.default_rng(4).normal(0, 0.005, (COUNT, 3))) @ bent[:, :3, :3]
+    for bound, doubted in ((0.001, 1), (0.02, 0)):
+        _, report = join(COUNT, [part("a", rows, truth, bound), part("b", rows, bent, bound)])
+        assert len(report.doubts()) == doubted
 
 
 def test_points_that_share_a_feature_of_a_photo_are_one_point() -> None:
