@@ -123,6 +123,9 @@ class KnownScale(FrozenModel, allow_inf_nan=False):
     metres_per_unit: float = Field(examples=[0.31], description="Of the input's world.")
 
 
+WEAK = 0.5  # of the photos at a seam; more are within honest bounds
+
+
 class PartReport(FrozenModel):
     """A part of a large set that was refined by itself."""
 
@@ -161,16 +164,16 @@ class PartsReport(FrozenModel):
 
     def doubts(self) -> tuple[str, ...]:
         """What did not join, and seams at which most photos disagree by more than the parts' bounds allow."""
-        out = [f"{one.name} was not joined: {one.why_not}." for one in self.parts if one.why_not]
+        missing = [f"{one.name} was not joined: {one.why_not}." for one in self.parts if one.why_not]
         if self.photos_left_out:
-            out.append(f"{self.photos_left_out} photos were placed by no part that joined.")
-        out += [
-            f"{one.parts[0]} and {one.parts[1]} disagree by {one.rotation_deg:.2g}° (median) on the {one.photos} photos "
-            "that both have, more than their bounds allow."
+            missing.append(f"{self.photos_left_out} photos were placed by no part that joined.")
+        weak = [
+            f"{one.parts[0]} and {one.parts[1]} disagree by {one.rotation_deg:.2g} degrees (median) on the {one.photos} "
+            "photos that both have, more than their bounds allow."
             for one in self.seams
-            if one.within is not None and one.within < 0.5
+            if one.within is not None and one.within < WEAK
         ]
-        return tuple(out)
+        return (*missing, *weak)
 
 
 class InputAccuracy(FrozenModel):

@@ -18,7 +18,7 @@ from biresnerf.data.model.refined_set import RefinedSet
 from biresnerf.data.points.tracks import KEPT, Tracks
 from biresnerf.data.seeding.colmap_tracks import most_observations
 from biresnerf.data.seeding.map_images import PARTS, SAME_DEG, MappedModel, numbered_names
-from biresnerf.data.seeding.match_poses import JUDGED_FROM, MatchedPoses, carry_model
+from biresnerf.data.seeding.match_poses import JUDGED_FROM, carry_model
 from biresnerf.errors import InputError
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.pose_error import rotation_between_deg
@@ -139,61 +139,76 @@ def joined_tracks(tracks: Sequence[Tracks | None], images: int) -> Tracks | None
 def join(photos: int, parts: Sequence[PartResult]) -> tuple[MappedModel, PartsReport]:
     """One model of all parts that join, in the frame of the largest, and how well any two of them agree.
 
-    The part that shares the most photos with those before it is carried onto them by these photos, robustly. It is not
-    forced: where too many of them disagree, or too few are shared, the part stays out. Of a photo in several parts the
-    pose with the smaller bound is taken.
+    The part that shares the most photos with those before it is next. Of a photo in several parts the pose with the
+    smaller bound is taken.
     """
-    n = photos
-    poses, placed = np.tile(np.eye(4), (n, 1, 1)), np.zeros(n, np.bool_)
-    bound, in_part = np.full(n, np.inf), np.array([np.isin(np.arange(n), part.model.rows) for part in parts])
-    reasons: dict[int, str] = {k: NOTHING for k, part in enumerate(parts) if part.tracks is None}
-    left = [k for k in range(len(parts)) if k not in reasons]
-    joined: list[int] = []
+    rig, why_not = _Rig.empty(photos), dict[str, str | None]()
+    left = sorted(parts, key=lambda part: len(part.model.rows))
     while left:
-        part = max(left, key=lambda k: ((in_part[k] & placed).sum(), in_part[k].sum(), -k))
+        part = max(reversed(left), key=rig.shared)
         left.remove(part)
-        model = parts[part].model
-        if joined and (in_part[part] & placed).sum() < JUDGED_FROM:
-            reasons[part] = FEW
-            continue
-        carried = carry_model(model, poses, placed) if joined else None
-        if joined and (
-            carried is None or _apart_deg(carried, poses, model.rows[placed[model.rows]]) > SAME_DEG
-        ):
-            reasons[part] = APART
-            continue
-        found = poses.copy() if carried is None else carried.world_from_cam
-        rows = model.rows if carried is None else model.rows[carried.placed[model.rows]]
-        if carried is None:
-            found[rows] = model.world_from_cam
-        known = np.full(n, np.inf)
-        known[model.rows] = np.where(np.isfinite(parts[part].bounds[:, 0]), parts[part].bounds[:, 0], np.inf)
-        taken = rows[~placed[rows] | (known[rows] < bound[rows])]
-        poses[taken], placed[taken], bound[taken] = found[taken], True, known[taken]
-        joined.append(part)
-    seams = [
-        _seam(parts[a], parts[b]) for a, b in combinations(sorted(joined), 2)
-        if (in_part[a] & in_part[b]).sum() >= JUDGED_FROM
-    ]  # fmt: skip
+        why_not[part.name] = rig.take(part)
+    joined = [part for part in parts if why_not[part.name] is None]
+    seams = [_seam(a, b) for a, b in combinations(joined, 2) if _common(a, b) >= JUDGED_FROM]
     report = PartsReport(
         parts=tuple(
-            PartReport(name=part.name, photos=len(part.model.rows), why_not=reasons.get(k))
-            for k, part in enumerate(parts)
+            PartReport(name=part.name, photos=len(part.model.rows), why_not=why_not[part.name])
+            for part in parts
         ),
         seams=tuple(seams),
-        photos_left_out=int(n - placed.sum()),
+        photos_left_out=int(photos - rig.placed.sum()),
     )
-    return _one_model(poses, placed, [parts[k].model for k in joined]), report
+    return _one_model(rig, [part.model for part in joined]), report
 
 
-def _apart_deg(carried: MatchedPoses, poses: NDArray[np.float64], shared: NDArray[np.int64]) -> float:
-    """By how much the photos that a part shares are turned there against what was joined before: the median."""
-    return float(np.median(rotation_between_deg(carried.world_from_cam[shared], poses[shared])))
+def _common(a: PartResult, b: PartResult) -> int:
+    return len(np.intersect1d(a.model.rows, b.model.rows))
 
 
-def _one_model(
-    poses: NDArray[np.float64], placed: NDArray[np.bool_], models: Sequence[MappedModel]
-) -> MappedModel:
+@dataclass(frozen=True, eq=False)
+class _Rig:
+    """The cameras of the whole set, as far as they are joined: poses, which of them are placed, and their bounds, rad."""
+
+    poses: NDArray[np.float64]
+    placed: NDArray[np.bool_]
+    bound: NDArray[np.float64]
+
+    @classmethod
+    def empty(cls, photos: int) -> _Rig:
+        return cls(np.tile(np.eye(4), (photos, 1, 1)), np.zeros(photos, np.bool_), np.full(photos, np.inf))
+
+    def shared(self, part: PartResult) -> int:
+        """How many of the part's photos are placed."""
+        return int(self.placed[part.model.rows].sum())
+
+    def take(self, part: PartResult) -> str | None:
+        """Carry a part onto what is there by the photos that both have; or why that cannot be. It is not forced."""
+        rows, found = part.model.rows, self.poses.copy()
+        if part.tracks is None:
+            return NOTHING
+        if self.placed.any():
+            if self.shared(part) < JUDGED_FROM:
+                return FEW
+            carried = carry_model(part.model, self.poses, self.placed)
+            both = rows[self.placed[rows]]
+            if carried is None or _apart_deg(carried.world_from_cam[both], self.poses[both]) > SAME_DEG:
+                return APART
+            found, trusted = carried.world_from_cam, carried.placed[rows]
+        else:
+            found[rows], trusted = part.model.world_from_cam, np.ones(len(rows), np.bool_)
+        bound = np.nan_to_num(part.bounds[:, 0], nan=np.inf, posinf=np.inf)
+        better = trusted & (~self.placed[rows] | (bound < self.bound[rows]))
+        taken = rows[better]
+        self.poses[taken], self.placed[taken], self.bound[taken] = found[taken], True, bound[better]
+        return None
+
+
+def _apart_deg(here: NDArray[np.float64], there: NDArray[np.float64]) -> float:
+    """By how much the cameras are turned against each other: the median."""
+    return float(np.median(rotation_between_deg(here, there)))
+
+
+def _one_model(rig: _Rig, models: Sequence[MappedModel]) -> MappedModel:
     """The joined model; of a lens that several parts found, the one of the part with the most photos."""
     lenses: dict[int, Camera] = {}
     for model in sorted(models, key=lambda one: len(one.rows)):
@@ -201,7 +216,7 @@ def _one_model(
     seen = sum(model.observations for model in models)
     error = sum(model.reprojection_px * model.observations for model in models) / max(1, seen)
     points = sum(model.points for model in models)
-    return MappedModel(PARTS, np.flatnonzero(placed), poses[placed], lenses, points, seen, error)
+    return MappedModel(PARTS, np.flatnonzero(rig.placed), rig.poses[rig.placed], lenses, points, seen, error)
 
 
 def _seam(a: PartResult, b: PartResult) -> SeamReport:
