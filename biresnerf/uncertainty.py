@@ -168,7 +168,7 @@ class PartsReport(FrozenModel):
         if self.photos_left_out:
             missing.append(f"{self.photos_left_out} photos were placed by no part that joined.")
         weak = [
-            f"{one.parts[0]} and {one.parts[1]} disagree by {one.rotation_deg:.2g} degrees (median) on the {one.photos} "
+            f"{one.parts[0]} and {one.parts[1]} disagree by {one.rotation_deg:.2g} degrees (median) on {one.photos} "
             "photos that both have, more than their bounds allow."
             for one in self.seams
             if one.within is not None and one.within < WEAK

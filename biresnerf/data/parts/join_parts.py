@@ -167,7 +167,7 @@ def _common(a: PartResult, b: PartResult) -> int:
 
 @dataclass(frozen=True, eq=False)
 class _Rig:
-    """The cameras of the whole set, as far as they are joined: poses, which of them are placed, and their bounds, rad."""
+    """The cameras of the whole set as far as they are joined: poses, which are placed, and their bounds (rad)."""
 
     poses: NDArray[np.float64]
     placed: NDArray[np.bool_]
