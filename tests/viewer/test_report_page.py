@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2
 
 from biresnerf.geometry.rigid import interpolate_pose
-from biresnerf.uncertainty import PoseUncertainty
+from biresnerf.uncertainty import PartReport, PartsReport, PoseUncertainty, SeamReport
 from biresnerf.viewer.report_html import write_report_html
 from tests.viewer.conftest import ARGUMENTS, CHROMIUM, HOSTILE, HOSTILE_IMAGE, SCREENSHOTS, VIEWS, open_report
 
@@ -202,10 +202,34 @@ def stated_page(browser, result, tmp_path_factory):
     )
     folder = tmp_path_factory.mktemp("stated") / "out"
     shutil.copytree(result.folder, folder)
-    write_report_html(folder, result.report.model_copy(update={"images": images}))
+    parts = PartsReport(
+        parts=(
+            PartReport(name="a", photos=6), PartReport(name="b", photos=6),
+            PartReport(name="c", photos=3, why_not="no"),
+        ),
+        seams=(
+            SeamReport(
+                parts=("a", "b"), photos=2, rotation_deg=0.021, rotation_deg_worst=0.43, position=1, position_worst=2
+            ),
+        ),
+    )  # fmt: skip
+    write_report_html(folder, result.report.model_copy(update={"images": images, "parts": parts}))
     opened = open_report(browser, folder / "report.html")
     yield opened.page
     opened.page.context.close()
+
+
+def test_the_page_says_how_well_the_parts_agree_that_a_set_was_joined_from(stated, opened):
+    def said(page) -> dict[str, list[str]]:
+        page.get_by_text("More figures").click()
+        terms = page.locator(".verdict details .figures > div").filter(visible=True).all()
+        return {term.locator("dt").text_content(): term.locator("dd").all_text_contents() for term in terms}
+
+    assert said(stated)["Parts agree to"] == [
+        "0.021°",
+        "on shared photos, 0.43° at most; 2 of 3 parts joined",
+    ]
+    assert "Parts agree to" not in said(opened.page)
 
 
 def test_the_table_says_how_exact_each_pose_is_and_finds_those_not_known(stated):

@@ -119,6 +119,10 @@ def summary(report: Report, output: Path) -> str:
             lines.append(
                 f"{100 * report.heldout.unshared_opacity:.1f} % of that render lies where no second camera looks"
             )
+    if report.parts is not None and report.parts.seams:
+        apart = sorted(seam.rotation_deg for seam in report.parts.seams)
+        agree = f"they agree to {apart[len(apart) // 2]:.2g} deg (median)"
+        lines.append(f"{len(report.parts.parts)} parts; on the photos that two have {agree}")
     lines += [f"warning: {warning}" for warning in report.warnings]
     lines.append(f"time: {sum(report.seconds.values()):.0f} s; results in {output}")
     if (output / REPORT_HTML).is_file():

@@ -1,6 +1,6 @@
 // The answer of a result: the verdict, its plain figures, warnings, and the photos that deserve a look.
 import type { ComponentChildren } from "preact";
-import type { PairedDifference, Report } from "schemas";
+import type { PairedDifference, PartsReport, Report } from "schemas";
 import type { ImageRow, SheetCell } from "../result/widget_data";
 import { count, fixed, median, short, signed } from "./numbers";
 import { worded } from "./option_words";
@@ -162,10 +162,22 @@ function moreFiguresOf(report: Report, rows: readonly ImageRow[]): Figure[] {
       value: `${short(median(turned), 2)}°`,
       note: `typical; ${short(Math.max(...turned), 2)}° at most`,
     },
+    ...(report.parts ? [partsFigure(report.parts)] : []),
     ...(report.heldout
       ? [{ name: "Final render", value: `${fixed(report.heldout.psnr, 1)} dB`, note: `PSNR of ${count(report.heldout.count, "unseen view")}` }]
       : []),
   ];
+}
+
+/** How well the parts agree that a large set was joined from. */
+function partsFigure({ parts, seams = [] }: PartsReport): Figure {
+  const joined = `${parts.filter(({ why_not }) => why_not == null).length} of ${count(parts.length, "part")} joined`;
+  const worst = Math.max(...seams.map((seam) => seam.rotation_deg_worst));
+  return {
+    name: "Parts agree to",
+    value: seams.length ? `${short(median(seams.map((seam) => seam.rotation_deg)), 2)}°` : "–",
+    note: seams.length ? `on shared photos, ${short(worst, 2)}° at most; ${joined}` : joined,
+  };
 }
 
 /** How sure a gain in PSNR is. */

@@ -18,6 +18,7 @@ from biresnerf.data.synthetic.scene import write_synthetic_scene
 from biresnerf.refinement.stages.checkpoint import load_checkpoint
 from biresnerf.report import Report
 from biresnerf.stages import CHECKPOINT
+from biresnerf.uncertainty import PartReport, PartsReport, SeamReport
 
 pytestmark = pytest.mark.slow
 
@@ -209,6 +210,12 @@ def test_the_same_command_goes_on_after_sigterm_and_is_then_finished(scene, term
     assert f"report: {output / 'report.html'}" in again.stdout
     (output / "report.html").unlink()  # as of an installation without its viewer
     assert "report.html" not in summary(report_of(output), output)
+    names = (PartReport(name="a", photos=3), PartReport(name="b", photos=3))
+    seam = SeamReport(
+        parts=("a", "b"), photos=2, rotation_deg=0.02, rotation_deg_worst=1, position=1, position_worst=2
+    )
+    joined = report_of(output).model_copy(update={"parts": PartsReport(parts=names, seams=(seam,))})
+    assert "2 parts; on the photos that two have they agree to 0.02 deg" in summary(joined, output)
 
 
 @pytest.mark.parametrize("changed", [{"seed": 3}, {"max_image_size": 20}])
