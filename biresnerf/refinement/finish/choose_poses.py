@@ -30,7 +30,7 @@ from biresnerf.refinement.finish.candidates import (
 )
 from biresnerf.refinement.finish.expected_errors import expected_errors
 from biresnerf.refinement.finish.gather_evidence import SplitEvidence
-from biresnerf.refinement.finish.given_poses import input_accuracy
+from biresnerf.refinement.finish.given_poses import input_accuracy, loosened
 from biresnerf.refinement.finish.lens_evidence import contradicted_focals, focal_certainty, given_focals
 from biresnerf.refinement.finish.lens_model import simple_lenses, supported_lenses
 from biresnerf.refinement.finish.outcome import Finish, fit_of, heeded, most_heeded
@@ -74,9 +74,13 @@ def choose_poses(
         fitted, left_out = (replace(each, tracks=None) for each in (split.fitted, split.left_out))
         split = replace(split, fitted=fitted, left_out=left_out, tracks=None)
         results = {name: each for name, each in results.items() if name == "adjusted-patches"}
-    given = input_accuracy(scene.dataset, most_heeded(results), split.fitted, options)
-    if given is not None and given.tells(prior):
+    best = most_heeded(results)
+    given = input_accuracy(scene.dataset, best, split.fitted, options)
+    looser = None if best is None else loosened(prior, best, split.fitted)
+    prior = looser or prior
+    if tells := given is not None and given.tells(prior):
         prior = given.prior(prior)
+    if tells or looser is not None:
         patched = results.get("adjusted-patches")
         results = adjust(refined, split.fitted, prior, announce, patched.halves if patched else None)
     adjusted = [as_candidate(name, each, split.fitted, cameras) for name, each in results.items()]

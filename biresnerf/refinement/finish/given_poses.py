@@ -131,12 +131,7 @@ def input_accuracy(
     if adjusted is None:
         return None
     known = np.array([frame.pose_source == "given" for frame in dataset.frames])
-    seen = np.zeros_like(known)
-    if evidence.tracks is not None:
-        seen[evidence.tracks.image] = True
-    if evidence.patches is not None:
-        seen[evidence.patches.host] = seen[evidence.patches.target] = True
-    found = given_poses(dataset.world_from_cam, adjusted.world_from_cam, known & seen)
+    found = given_poses(dataset.world_from_cam, adjusted.world_from_cam, known & _seen(evidence, len(known)))
     if found is None:
         return None
     if dataset.body_offset is not None:
@@ -144,6 +139,40 @@ def input_accuracy(
     found = found.as_stated(math.radians(options.input_rotation_deg), options.input_position)
     logger.info("the input's poses: %s", accuracy_report(found))
     return found
+
+
+def loosened(prior: PosePrior, adjusted: Adjustment, evidence: Evidence) -> PosePrior | None:
+    """The prior with deviations as large as the errors of its poses; None where it states none that are too small.
+
+    The errors are measured against poses that were adjusted with it: a field that binds cameras loosely bends rigs and
+    loses single cameras, by more than is believed of it.
+    """
+    known = _seen(evidence, len(prior.rotation)) & ~prior.fixed
+    found = given_poses(prior.world_from_cam, adjusted.world_from_cam, known)
+    if found is None:
+        return None
+    vague = np.where(known, 1 / np.sqrt(np.maximum(found.weight, EXACT**2)), 0.0)
+    rotation, position = found.deviations
+    looser = replace(
+        prior,
+        rotation=np.maximum(prior.rotation, rotation * vague),
+        position=np.maximum(prior.position, position * vague),
+    )
+    changed = (looser.rotation > prior.rotation) | (looser.position > prior.position)
+    if not changed.any():
+        return None
+    logger.info("%d of %d poses are less exact than was believed of them", changed.sum(), len(changed))
+    return looser
+
+
+def _seen(evidence: Evidence, images: int) -> NDArray[np.bool_]:
+    """Which images [n] tracks or patches tell of."""
+    seen = np.zeros(images, np.bool_)
+    if evidence.tracks is not None:
+        seen[evidence.tracks.image] = True
+    if evidence.patches is not None:
+        seen[evidence.patches.host] = seen[evidence.patches.target] = True
+    return seen
 
 
 def accuracy_report(given: GivenPoses) -> InputAccuracy:
