@@ -16,6 +16,7 @@ from biresnerf.refinement.finish.given_poses import (
     accuracy_report,
     accuracy_warnings,
     given_poses,
+    loosened,
 )
 from tests.refinement.adjustment.rig import disturbed, observed, pinholes, ring, rotation_errors_deg
 
@@ -158,3 +159,33 @@ def test_where_feature_matches_are_few_accurate_poses_help_and_wild_ones_do_no_h
     before = rotation_errors_deg(alone, truth).mean()
     assert error(0.001, 0.004) < 0.8 * before
     assert error(0.2, 1.0) < 1.05 * before
+
+
+def test_a_prior_about_poses_far_worse_than_believed_holds_the_cameras_no_more(rng):
+    truth = ring(COUNT, rng)
+    tracks = observed(truth, rng.uniform(-0.6, 0.6, (60, 3)), pinholes(COUNT), rng, noise_px=0.5)
+    evidence, start = Evidence(pinholes(COUNT), tracks), disturbed(truth, rng, 0.06, 0.3)
+    believed = PosePrior.equal(start, 0.02, 0.08)
+    held = adjust_poses(start, evidence, believed)
+    looser = loosened(believed, held, evidence)
+    assert looser is not None
+    assert 0.02 < np.median(looser.rotation) < 3 * 0.06
+    free = adjust_poses(start, evidence, looser)
+    before, after = (rotation_errors_deg(each.world_from_cam, truth) for each in (held, free))
+    assert after.mean() < 0.8 * before.mean()
+
+
+def test_a_prior_that_believes_no_more_than_is_true_stays_and_fixed_cameras_stay_fixed(rng):
+    truth = ring(COUNT, rng)
+    tracks = observed(truth, rng.uniform(-0.6, 0.6, (200, 3)), pinholes(COUNT), rng, noise_px=0.5)
+    evidence = Evidence(pinholes(COUNT), tracks)
+    for error, changes in ((0.002, False), (0.05, True)):
+        start = disturbed(truth, rng, error, 4 * error)
+        start[:3] = truth[:3]
+        prior = PosePrior.equal(start, 0.02, 0.08)
+        prior.rotation[:3] = prior.position[:3] = 0.0
+        looser = loosened(prior, adjust_poses(start, evidence, prior), evidence)
+        assert (looser is not None) == changes
+        if looser is not None:
+            assert not looser.rotation[:3].any()
+            assert not looser.position[:3].any()
