@@ -142,7 +142,7 @@ def input_accuracy(
 
 
 def loosened(prior: PosePrior, adjusted: Adjustment, evidence: Evidence) -> PosePrior | None:
-    """The prior with deviations as large as the errors of its poses; None where it states none that are too small.
+    """The prior with deviations as large as the errors of its poses; None where the usual camera's are no larger.
 
     The errors are measured against poses that were adjusted with it: a field that binds cameras loosely bends rigs and
     loses single cameras, by more than is believed of it.
@@ -151,18 +151,16 @@ def loosened(prior: PosePrior, adjusted: Adjustment, evidence: Evidence) -> Pose
     found = given_poses(prior.world_from_cam, adjusted.world_from_cam, known)
     if found is None:
         return None
-    vague = np.where(known, 1 / np.sqrt(np.maximum(found.weight, EXACT**2)), 0.0)
     rotation, position = found.deviations
-    looser = replace(
+    if rotation <= np.median(prior.rotation[known]) and position <= np.median(prior.position[known]):
+        return None
+    logger.info("the field's poses are off by more than was believed: %.2g deg", math.degrees(found.rotation))
+    vague = np.where(known, 1 / np.sqrt(np.maximum(found.weight, EXACT**2)), 0.0)
+    return replace(
         prior,
         rotation=np.maximum(prior.rotation, rotation * vague),
         position=np.maximum(prior.position, position * vague),
     )
-    changed = (looser.rotation > prior.rotation) | (looser.position > prior.position)
-    if not changed.any():
-        return None
-    logger.info("%d of %d poses are less exact than was believed of them", changed.sum(), len(changed))
-    return looser
 
 
 def _seen(evidence: Evidence, images: int) -> NDArray[np.bool_]:
