@@ -13,7 +13,7 @@ class EvidenceNumbers:
 
     most_observations: int = 40_000  # of tracks, in candidates
     # The same in what is returned. On scarf 21,000 of 133,000 leave 0.090 deg, all of them 0.048.
-    most_in_the_end: int = 200_000
+    most_in_the_end: int = 400_000
     up_to_cameras: int = 500  # of these; more cameras get more of both, in proportion (`colmap_tracks`)
     lens_observations: int = 20_000  # that choose a lens's parameters; more add nothing
     left_out_one_in: int = 5  # patches
