@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, get_origin
 
 import click
@@ -17,10 +16,7 @@ LISTS = {name for name, field in RefineOptions.model_fields.items() if get_origi
 
 
 def parse_settings(texts: tuple[str, ...]) -> dict[str, Any]:
-    """Values by key; a value that is not valid JSON is text, and a list with commas or the lines of @FILE.
-
-    Raises `InputError`.
-    """
+    """Values by key; a value that is not valid JSON is text, and a list with commas. Raises `InputError`."""
     settings: dict[str, Any] = {}
     for text in texts:
         key, separator, value = text.partition("=")
@@ -28,22 +24,11 @@ def parse_settings(texts: tuple[str, ...]) -> dict[str, Any]:
             raise InputError("invalid_options", f"{text!r} is not key=value.", where="--set")
         if key in settings:
             raise InputError("invalid_options", f"{key} is set twice.", where="--set")
-        if key in LISTS and value.startswith("@"):
-            settings[key] = _lines(Path(value[1:]))
-            continue
         try:
             settings[key] = json.loads(value)
         except ValueError:
             settings[key] = [part.strip() for part in value.split(",")] if key in LISTS else value
     return settings
-
-
-def _lines(path: Path) -> list[str]:
-    """The lines of a file that hold something."""
-    try:
-        return [line.strip() for line in path.read_text("utf-8").splitlines() if line.strip()]
-    except (OSError, ValueError) as error:
-        raise InputError("invalid_options", f"cannot be read ({error}).", where=str(path)) from error
 
 
 def settings_option(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -54,8 +39,7 @@ def settings_option(command: Callable[..., Any]) -> Callable[..., Any]:
         multiple=True,
         metavar="KEY=VALUE",
         callback=lambda _context, _parameter, texts: parse_settings(texts),
-        help="Set any other option; may be repeated. KEY=@FILE takes a list from the file's lines. docs/options.md and "
-        "GET /v1/options list them.",
+        help="Set any other option; may be repeated. docs/options.md and GET /v1/options list them.",
     )(command)
 
 

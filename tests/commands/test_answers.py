@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from pathlib import Path
 
 import pytest
 
@@ -46,16 +45,6 @@ def test_a_setting_is_json_where_it_can_be_and_else_text() -> None:
         "exports": ["kitti", "bundler"],
         "fixed": ["a"],
     }
-
-
-def test_a_list_is_read_from_the_lines_of_a_file(tmp_path: Path) -> None:
-    (tmp_path / "names.txt").write_text("a, b.jpg\n\n c.jpg \n", "utf-8")
-    assert parse_settings((f"photos=@{tmp_path / 'names.txt'}", "title=@home")) == {
-        "photos": ["a, b.jpg", "c.jpg"], "title": "@home",
-    }  # fmt: skip
-    with pytest.raises(InputError) as caught:
-        parse_settings((f"fixed=@{tmp_path / 'nothing.txt'}",))
-    assert (caught.value.code, caught.value.where) == ("invalid_options", str(tmp_path / "nothing.txt"))
 
 
 @pytest.mark.parametrize("texts", [("steps",), ("=1",), ("a=1", "a=2")])

@@ -13,7 +13,7 @@ import click
 from biresnerf.commands import exit_codes
 from biresnerf.commands.answers import json_option, show
 from biresnerf.commands.settings_option import budget_option, settings_option
-from biresnerf.errors import Interrupted
+from biresnerf.errors import InputError, Interrupted
 from biresnerf.options.presets import PRESET_IF_LEFT_OUT, PRESETS
 from biresnerf.options.refine_options import parse_options
 from biresnerf.report import Report
@@ -36,6 +36,10 @@ from biresnerf.viewer.report_html import REPORT_HTML
     help="A finished result of some of the photos: they keep its poses and lenses, and the others join its frame.",
 )  # fmt: skip
 @click.option(
+    "--photos-from", type=click.Path(path_type=Path),
+    help="A file with the names of the photos to use, one a line, as `split` writes them; the option `photos`.",
+)  # fmt: skip
+@click.option(
     "--join", "parts", multiple=True, type=click.Path(path_type=Path),
     help="The result of a part of the photos (see `split`), or a folder of such; may be repeated. They are joined.",
 )  # fmt: skip
@@ -53,6 +57,7 @@ def refine_command(
     time_budget_s: float | None,
     settings: dict[str, Any],
     fixed_from: Path | None,
+    photos_from: Path | None,
     parts: tuple[Path, ...],
     overwrite: bool,
     open_report: bool,
@@ -67,6 +72,8 @@ def refine_command(
     """
     named = {"preset": preset, "device": device, "seed": seed, "time_budget_s": time_budget_s}
     options = {**settings, **{key: value for key, value in named.items() if value is not None}}
+    if photos_from is not None:
+        options["photos"] = _lines(photos_from)
     logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, format="%(message)s")
     parse_options(options)  # what is no option must not be taken for another argument
     from biresnerf.run.refine import refine
@@ -96,6 +103,14 @@ def refine_command(
     if open_report:
         click.launch(str(output / REPORT_HTML))
     return exit_codes.DONE
+
+
+def _lines(path: Path) -> list[str]:
+    """The lines of a file that hold something."""
+    try:
+        return [line.strip() for line in path.read_text("utf-8").splitlines() if line.strip()]
+    except (OSError, ValueError) as error:
+        raise InputError("invalid_options", f"cannot be read ({error}).", where=str(path)) from error
 
 
 def summary(report: Report, output: Path) -> str:

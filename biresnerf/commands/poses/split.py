@@ -19,11 +19,11 @@ from biresnerf.options.refine_options import parse_options
 @click.option(
     "--output", "-o", required=True, type=click.Path(path_type=Path), help="Folder for the lists of photos."
 )
-@click.option("--photos", type=int, default=None, help="Of each part, about; default: 400.")
+@click.option("--most", type=int, default=None, help="Photos of each part, about; default: 400.")
 @settings_option
 @json_option
 def split_command(
-    input_path: Path, output: Path, photos: int | None, settings: dict[str, Any], as_json: bool
+    input_path: Path, output: Path, most: int | None, settings: dict[str, Any], as_json: bool
 ) -> None:
     """Cut INPUT into parts of photos that see the same, a fifth of them shared with other parts.
 
@@ -38,7 +38,7 @@ def split_command(
 
     dataset = read_dataset(input_path, videos=VideoReading(asked.video_frames))
     dataset = without_photos(dataset, asked.leave_out, asked.photos)
-    parts = cut_set(dataset, PHOTOS if photos is None else photos)
+    parts = cut_set(dataset, PHOTOS if most is None else most)
     require_empty(output)
     output.mkdir(parents=True, exist_ok=True)
     files, commands = [], []
@@ -49,7 +49,7 @@ def split_command(
         files.append(names)
         result = output / "results" / names.stem
         commands.append(
-            f"biresnerf refine {quote(str(input_path))} --set photos=@{quote(str(names))} --output {quote(str(result))}"
+            f"biresnerf refine {quote(str(input_path))} --photos-from {quote(str(names))} --output {quote(str(result))}"
         )
     join = f"biresnerf refine {quote(str(input_path))} --join {quote(str(output / 'results'))} --output OUT"
     found = {

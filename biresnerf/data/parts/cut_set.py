@@ -16,7 +16,7 @@ SHARED = 0.2  # of a part's photos, that another part has as its own
 FEWEST = 20  # photos of a part
 
 
-def cut_set(dataset: Dataset, photos: int = PHOTOS) -> tuple[NDArray[np.int64], ...]:
+def cut_set(dataset: Dataset, most: int = PHOTOS) -> tuple[NDArray[np.int64], ...]:
     """Rows of each part's photos, ascending; every photo is in one part at least.
 
     METIS cuts the graph of likely pairs where few of them are (Karypis and Kumar, A fast and high quality multilevel
@@ -24,22 +24,22 @@ def cut_set(dataset: Dataset, photos: int = PHOTOS) -> tuple[NDArray[np.int64], 
     that both photos have. Each part then takes photos of the others, those that hang together with it most.
 
     Args:
-        photos: about how many a part has, shared ones included.
+        most: about how many photos a part has, shared ones included.
 
     Raises:
         InputError: ``invalid_options`` for parts that are too small; ``extra_missing``.
     """
-    if photos < FEWEST:
+    if most < FEWEST:
         raise InputError(
-            "invalid_options", f"a part of {photos} photos is too small.", where="photos",
+            "invalid_options", f"a part of {most} photos is too small.", where="most",
             hint=f"Name {FEWEST} or more.",
         )  # fmt: skip
-    count = int(np.ceil(len(dataset) / (photos * (1 - SHARED)))) if len(dataset) > photos else 1
+    count = int(np.ceil(len(dataset) / (most * (1 - SHARED)))) if len(dataset) > most else 1
     if count == 1:
         return (np.arange(len(dataset)),)
     weights = _weights(likely_pairs(dataset), len(dataset))
     own = _metis(weights, count)
-    borrowed = round(photos * SHARED)
+    borrowed = round(most * SHARED)
     parts = []
     for part in range(count):
         near: defaultdict[int, int] = defaultdict(int)

@@ -158,6 +158,14 @@ def test_wrong_flags_are_refused_by_name(scene, tmp_path, flags, parts):
     assert_refused(result, *parts)
 
 
+def test_photos_are_chosen_by_the_lines_of_a_file(scene, tmp_path):
+    (tmp_path / "names.txt").write_text("\nnosuch.png\n", "utf-8")
+    for name, code in (("missing.txt", "invalid_options"), ("names.txt", "photos_not_found")):
+        asked = [*command(scene, tmp_path / "out"), "--photos-from", str(tmp_path / name)]
+        refused = subprocess.run(asked, capture_output=True, text=True, check=False, timeout=300)
+        assert_refused(refused, code, name if code == "invalid_options" else "nosuch.png")
+
+
 def test_a_broken_transforms_file_is_named_with_the_field(scene, tmp_path):
     broken = shutil.copytree(scene, tmp_path / "scene")
     document = json.loads((broken / "transforms.json").read_text())

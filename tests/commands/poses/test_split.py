@@ -9,7 +9,6 @@ from pathlib import Path
 from click.testing import CliRunner
 
 from biresnerf.commands.poses.split import split_command
-from biresnerf.commands.settings_option import parse_settings
 from biresnerf.data.formats.read_dataset import read_dataset
 from tests.data.scenes import write_image
 
@@ -18,7 +17,7 @@ def test_the_printed_commands_name_every_photo_and_the_folder_that_is_joined(tmp
     scene, parts = tmp_path / "my scene", tmp_path / "parts"
     for index in range(50):
         write_image(scene / f"{index:03}.png", seed=index // 10)
-    asked = [str(scene), "--output", str(parts), "--photos", "25"]
+    asked = [str(scene), "--output", str(parts), "--most", "25"]
     result = CliRunner().invoke(split_command, [*asked, "--json"])
     assert result.exit_code == 0, (result.output, result.exception)
     found = json.loads(result.stdout)
@@ -26,7 +25,7 @@ def test_the_printed_commands_name_every_photo_and_the_folder_that_is_joined(tmp
     for command, part in zip(found["refine"], found["parts"], strict=True):
         words = shlex.split(command)
         assert words[:3] == ["biresnerf", "refine", str(scene)]
-        names = parse_settings((words[words.index("--set") + 1],))["photos"]
+        names = Path(words[words.index("--photos-from") + 1]).read_text("utf-8").splitlines()
         assert len(names) == part["photos"]
         seen |= set(names)
         results.add(Path(words[words.index("--output") + 1]))

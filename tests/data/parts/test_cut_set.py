@@ -59,7 +59,7 @@ def test_a_small_set_stays_whole_and_too_small_parts_are_refused(corridor: Datas
     np.testing.assert_array_equal(whole, np.arange(COUNT))
     with pytest.raises(InputError) as caught:
         cut_set(corridor, 5)
-    assert (caught.value.code, caught.value.where) == ("invalid_options", "photos")
+    assert (caught.value.code, caught.value.where) == ("invalid_options", "most")
     assert caught.value.hint
 
 
