@@ -130,7 +130,7 @@ class _Options(BaseModel, Generic[Open, DeviceName]):
     bad_frames: Annotated[Literal["leave_out", "refuse"], Option("seeding", "Bad frames")] = Field(
         "leave_out", description="Frames whose photo, pose or lens is missing or broken, where most are good."
     )
-    photos: Annotated[Names, Option("seeding", "Photos to use", level="usual")] = Field(
+    photos: Annotated[Names, Option("seeding", "Photos to use")] = Field(
         (),
         max_length=10_000,
         description="Names of photos to use, as if the set had no others; empty: all of them.",
