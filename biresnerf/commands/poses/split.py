@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -42,6 +43,12 @@ def split_command(
     require_empty(output)
     output.mkdir(parents=True, exist_ok=True)
     files, commands = [], []
+    source = " ".join(
+        [
+            quote(str(input_path)),
+            *(f"--set {quote(f'{key}={json.dumps(value)}')}" for key, value in settings.items()),
+        ]
+    )
     width = max(2, len(str(len(parts))))
     for number, rows in enumerate(parts, start=1):
         names = output / f"part-{number:0{width}}.txt"
@@ -49,9 +56,9 @@ def split_command(
         files.append(names)
         result = output / "results" / names.stem
         commands.append(
-            f"biresnerf refine {quote(str(input_path))} --photos-from {quote(str(names))} --output {quote(str(result))}"
+            f"biresnerf refine {source} --photos-from {quote(str(names))} --output {quote(str(result))}"
         )
-    join = f"biresnerf refine {quote(str(input_path))} --join {quote(str(output / 'results'))} --output OUT"
+    join = f"biresnerf refine {source} --join {quote(str(output / 'results'))} --output OUT"
     found = {
         "photos": len(dataset),
         "parts": [{"file": str(name), "photos": len(rows)} for name, rows in zip(files, parts, strict=True)],

@@ -82,18 +82,16 @@ def read_part(dataset: Dataset, folder: Path) -> PartResult:
 
 def _tracks(found: RefinedSet, row_of: NDArray[np.int64]) -> Tracks | None:
     """The points that features of the photos show."""
-    points, row_of_id = found.model.points, dict(zip(found.image_ids, row_of.tolist(), strict=True))
-    if found.points_source not in ("features", "tracks") or not len(points):
+    seen = [
+        (point, row_of[image], *xy)
+        for point, landmark in enumerate(found.landmarks())
+        for image, (_, xy) in landmark.seen.items()
+    ]
+    if not seen:
         return None
-    image = np.array([row_of_id[number] for number in points.track_image_ids.tolist()], np.int64)
-    xy = np.stack([
-        found.model.images[number].points2d_px[feature]
-        for number, feature in zip(
-            points.track_image_ids.tolist(), points.track_point2d_indices.tolist(), strict=True
-        )
-    ])  # fmt: skip
-    order = np.lexsort((image, points.owner))
-    return Tracks.of(points.owner[order], image[order], xy[order])
+    point, row, x, y = np.array(seen).T
+    order = np.lexsort((row, point))
+    return Tracks.of(point[order], row[order], np.column_stack([x, y])[order])
 
 
 @dataclass(frozen=True)
@@ -142,18 +140,18 @@ def join(photos: int, parts: Sequence[PartResult]) -> tuple[MappedModel, PartsRe
     The part that shares the most photos with those before it is next. Of a photo in several parts the pose with the
     smaller bound is taken.
     """
-    rig, why_not = _Rig.empty(photos), dict[str, str | None]()
-    left = sorted(parts, key=lambda part: len(part.model.rows))
+    rig, why_not = _Rig.empty(photos), dict[int, str | None]()
+    left = sorted(range(len(parts)), key=lambda k: -len(parts[k].model.rows))
     while left:
-        part = max(reversed(left), key=rig.shared)
-        left.remove(part)
-        why_not[part.name] = rig.take(part)
-    joined = [part for part in parts if why_not[part.name] is None]
+        following = max(left, key=lambda k: rig.shared(parts[k]))
+        left.remove(following)
+        why_not[following] = rig.take(parts[following])
+    joined = [part for k, part in enumerate(parts) if why_not[k] is None]
     seams = [_seam(a, b) for a, b in combinations(joined, 2) if _common(a, b) >= JUDGED_FROM]
     report = PartsReport(
         parts=tuple(
-            PartReport(name=part.name, photos=len(part.model.rows), why_not=why_not[part.name])
-            for part in parts
+            PartReport(name=part.name, photos=len(part.model.rows), why_not=why_not[k])
+            for k, part in enumerate(parts)
         ),
         seams=tuple(seams),
         photos_left_out=int(photos - rig.placed.sum()),

@@ -83,6 +83,12 @@ def test_a_part_that_contradicts_the_others_or_shares_too_little_stays_out(
     assert "far" in report.doubts()[1]
 
 
+def test_parts_of_one_name_keep_their_own_reasons(truth: NDArray[np.float64]) -> None:
+    parts = [part("out", np.arange(20), truth[:20]), part("out", np.arange(19, 30), truth[19:30])]
+    _, report = join(COUNT, parts)
+    assert [one.why_not for one in report.parts] == [None, FEW]
+
+
 def test_of_a_shared_photo_the_pose_with_the_smaller_bound_is_taken(truth: NDArray[np.float64]) -> None:
     rough = truth[:24].copy()
     rough[:, :3, :3] = rotation_of(np.random.default_rng(0).normal(0, 0.01, (24, 3))) @ rough[:, :3, :3]
