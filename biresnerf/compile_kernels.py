@@ -24,8 +24,10 @@ from numba.core import config
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.field.backends import directions_for
 from biresnerf.field.cpu.field import CpuField
+from biresnerf.field.cpu.ray_kernels import add_harmonics_gradient, ray_gradients
 from biresnerf.field.grid_levels import grid_levels
 from biresnerf.field.radiance_field import FieldRates, FieldShape, Marching, Merging, PositionGradient, Rays
+from biresnerf.field.spherical_harmonics import VIEW_FEATURES
 from biresnerf.forecast.rates import cache_folder
 from biresnerf.geometry.camera.camera import Intrinsics
 from biresnerf.geometry.camera.camera_models import Camera
@@ -39,6 +41,7 @@ from biresnerf.refinement.optimise.renderer import cast_rays, viewing_directions
 from biresnerf.refinement.parameters.pose_parameters import PoseParameters
 
 SIZE, BASELINE = 32, 0.125  # px, and as a share of the distance to the scene: four pixels
+RATES = FieldRates(1e-3, 1e-3, (1e-3,) * 2, 1e-3)
 
 
 class KernelCompilation:
@@ -61,7 +64,7 @@ class KernelCompilation:
         self._field = field
         if _stamp(field).exists():
             return False
-        for part in ("render", "rest") if field else ("adjustment",):
+        for part in ("render", "gradients", "adjustment") if field else ("adjustment",):
             command = [sys.executable, "-m", "biresnerf.compile_kernels", part]
             self._children.append(
                 subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
@@ -106,11 +109,16 @@ def _stamp(field: bool) -> Path:
 
 
 @cache  # once in a process
-def compile_field_kernels(*, backward: bool = True) -> None:
-    """Run every kernel once on a tiny field, as a step does; without ``backward`` only those that render."""
-    shape = FieldShape(grid_levels(2, 4, 8, 10), grid_levels(2, 16, 32, 10), unbounded=False)
-    field = CpuField(shape, 0, torch.device("cpu"), workers=1)
-    field.start_reconstruction()
+def compile_field_kernels() -> None:
+    """Run every kernel once on a tiny field, as a step does."""
+    field, colour = _render_one_ray()
+    colour.sum().backward()
+    field.step(RATES)
+
+
+def _render_one_ray() -> tuple[CpuField, torch.Tensor]:
+    """A tiny field, and the colour of a ray through it."""
+    field = _tiny_field()
     origin = torch.tensor([[0.0, 0.0, -2.0]], requires_grad=True)
     direction = torch.tensor([[0.0, 0.0, 1.0]], requires_grad=True)
     rays = Rays(origin, direction, torch.ones(1, 3), torch.zeros(1), trained=1)
@@ -120,9 +128,29 @@ def compile_field_kernels(*, backward: bool = True) -> None:
     marching = Marching(0.1, 0.1, 10.0, 64, occupied, Merging(light=0.03, most=8))
     colour = field.render(rays, marching, PositionGradient()).colour
     field.density(torch.full((1, 3), 0.5))
-    if backward:
-        colour.sum().backward()
-        field.step(FieldRates(1e-3, 1e-3, (1e-3,) * 2, 1e-3))
+    return field, colour
+
+
+def _tiny_field() -> CpuField:
+    shape = FieldShape(grid_levels(2, 4, 8, 10), grid_levels(2, 16, 32, 10), unbounded=False)
+    field = CpuField(shape, 0, torch.device("cpu"), workers=1)
+    field.start_reconstruction()
+    return field
+
+
+def compile_backward_kernels() -> None:
+    """Run the kernels of the field's backward pass and of its update, and none of its forward pass."""
+    field, none = _tiny_field(), np.zeros((1, 3), np.float32)
+    samples, view, one = (
+        field.unseen_sample(),
+        np.zeros((1, VIEW_FEATURES), np.float32),
+        np.ones(1, np.float32),
+    )
+    dx, g_view = field.render_backward(samples, view, none, one, none, one, PositionGradient())
+    g_origin, g_direction = np.empty_like(none), np.empty_like(none)
+    ray_gradients(none, none, samples.offset, samples.t, dx, field.shape.unbounded, g_origin, g_direction)
+    add_harmonics_gradient(none, g_view, g_direction)
+    field.step(RATES)
 
 
 @cache
@@ -166,18 +194,20 @@ def _adjust_two_cameras() -> None:
 
 
 def _compile_part(part: str) -> None:
-    """Compile a part; two take equally long: ``render``, the field's forward pass, and ``rest``."""
+    """Compile one of three parts that take about equally long, and share few kernels."""
     if part == "render":
-        compile_field_kernels(backward=False)
-        return
-    _adjust_two_cameras()
-    if part == "rest":
+        _render_one_ray()
+    elif part == "gradients":
+        compile_backward_kernels()
         _cast_one_ray()
-        compile_field_kernels()
+    else:
+        _adjust_two_cameras()
 
 
 if __name__ == "__main__":
     if len(sys.argv) > 1:
         _compile_part(sys.argv[1])
     else:
-        compile_kernels()
+        with KernelCompilation() as compilation:
+            compilation.start(field=True)
+            compilation.finish(lambda: None)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from types import ModuleType
 
 import numpy as np
 import pytest
 from numba.core.dispatcher import Dispatcher
 from numba.core.registry import cpu_target
 
-from biresnerf.compile_kernels import compile_kernels
+from biresnerf.compile_kernels import compile_backward_kernels, compile_field_kernels, compile_kernels
+from biresnerf.field.cpu import encoding, network, ray_kernels, samples, segments_backward
 from biresnerf.refinement.adjustment.adjustment import adjust_poses, misfit
 from biresnerf.refinement.adjustment.evidence import Evidence, PosePrior
 from biresnerf.refinement.adjustment.kernels import patches, tracks
@@ -21,9 +23,12 @@ from tests.refinement.adjustment.test_patch_adjustment import Plane
 pytestmark = pytest.mark.slow
 
 
-def compiled() -> dict[str, int]:
-    """For how many kinds of arguments each kernel of the adjustment is compiled; those inside others are not listed."""
-    kernels = {f"{room.__name__}.{name}": k for room in (patches, tracks) for name, k in vars(room).items()}
+ADJUSTMENT, FIELD = (patches, tracks), (encoding, network, ray_kernels, samples, segments_backward)
+
+
+def compiled(modules: tuple[ModuleType, ...] = ADJUSTMENT) -> dict[str, int]:
+    """For how many kinds of arguments each kernel is compiled; those inside others are not listed."""
+    kernels = {f"{room.__name__}.{name}": k for room in modules for name, k in vars(room).items()}
     return {
         name: len(kernel.signatures)
         for name, kernel in kernels.items()
@@ -48,6 +53,15 @@ def test_an_adjustment_of_cameras_and_lenses_compiles_nothing_more():
     assert compiled() == before
 
 
+def test_the_backward_kernels_compiled_alone_are_those_of_a_step():
+    """Otherwise a first run would compile them twice, the second time while nothing else goes on."""
+    compile_field_kernels()
+    of_a_step = compiled(FIELD)
+    assert of_a_step["biresnerf.field.cpu.segments_backward.render_segments_backward"] == 1
+    compile_backward_kernels()
+    assert compiled(FIELD) == of_a_step
+
+
 @pytest.mark.parametrize("first", ["biresnerf.resume", "biresnerf.refinement.kernels.batches"])
 def test_kernels_are_found_in_the_cache_whichever_module_loads_numba(first):
     """The cache is asked for a processor, and Numba reads which one when it meets its first kernel."""
@@ -61,7 +75,7 @@ print(*cpu_target.target_context.codegen().magic_tuple())
     assert "-prefer-256-bit" in ran.stdout
 
 
-@pytest.mark.parametrize("part", ["render", "rest", "adjustment"])
+@pytest.mark.parametrize("part", ["render", "gradients", "adjustment"])
 def test_the_processes_that_a_run_starts_compile_without_an_error(part: str):
     """An error there would show only in time: the run itself would compile."""
     subprocess.run([sys.executable, "-m", "biresnerf.compile_kernels", part], check=True)

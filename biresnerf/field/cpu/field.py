@@ -175,6 +175,33 @@ class CpuField(GridField):
             self._clearances = (occupied, occupied._version, clearance)
         return clearance
 
+    def _samples(
+        self, marched: tuple[Any, ...], trained: int, features: np.ndarray, jacobians: list[np.ndarray]
+    ) -> Samples:
+        """What `march` found, with the features there, and room for what compositing leaves."""
+        offset, _x, t, *_ = marched
+        segment, learning = segments(offset, trained)
+        take, n, count = self._buffers.take, len(t), len(offset) - 1
+        composited = Composited(
+            take("outputs", OUTPUTS * n), take("density", n), take("alpha", n), take("kept", n, dtype=np.int32),
+            take("kept begin", count, dtype=np.int64), take("kept end", count, dtype=np.int64),
+            take("colour", 3 * n),
+        )  # fmt: skip
+        return Samples(segment, learning, *marched, features, jacobians, composited, self._weights())
+
+    def unseen_sample(self) -> Samples:
+        """One ray with one sample that no light reaches, as a forward pass leaves it.
+
+        Kernels of the backward pass compile with it while another process compiles those of the forward pass.
+        """
+        features = np.zeros((self._width(self.modules), 1), f4)
+        jacobians = [np.zeros((self.grids[name].levels, 6, 1), f4) for name in self.modules]
+        t, dt, ray = np.ones(1, f4), np.ones(1, f4), np.zeros(1, np.int32)
+        samples = self._samples((np.arange(2), np.zeros(3, f4), t, dt, ray, 1), 1, features, jacobians)
+        for array in samples.composited:
+            array.fill(0)
+        return samples
+
     def render_forward(self, origin: np.ndarray, direction: np.ndarray, view: np.ndarray, rays: Rays,
                        marching: Marching, gradient: PositionGradient | None,
                        ) -> tuple[Samples, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
@@ -182,23 +209,13 @@ class CpuField(GridField):
 
         `gradient` is None where positions need none.
         """
-        take, count = self._buffers.take, len(origin)
+        count = len(origin)
         offset, x, t, dt, ray, marched = self.march(origin, direction, rays.jitter.numpy(), marching)
-        n = len(t)
         features, jacobians = self._encode(x, gradient, "render", self.modules)
-        segment, learning = segments(offset, rays.trained)
-        samples = Samples(
-            segment, learning, marched, offset, x, t, dt, ray, features, jacobians,
-            Composited(
-                take("outputs", OUTPUTS * n), take("density", n), take("alpha", n), take("kept", n, dtype=np.int32),
-                take("kept begin", count, dtype=np.int64), take("kept end", count, dtype=np.int64),
-                take("colour", 3 * n),
-            ),
-            self._weights(),
-        )  # fmt: skip
+        samples = self._samples((offset, x, t, dt, ray, marched), rays.trained, features, jacobians)
         colour, opacity, depth = np.empty((count, 3), f4), np.empty(count, f4), np.empty(count, f4)
         render_segments(
-            segment, offset, t, dt, ray, features.reshape(-1), len(features), view.reshape(-1),
+            samples.segment, offset, t, dt, ray, features.reshape(-1), len(features), view.reshape(-1),
             rays.background.numpy(), tuple(w.reshape(-1) for w in samples.weights), samples.composited,
             colour, opacity, depth, tasks(), self.workers,
         )  # fmt: skip

@@ -36,12 +36,12 @@ class Samples:
 
     segment: np.ndarray
     learning: int
-    marched: int
     offset: np.ndarray
     x: np.ndarray
     t: np.ndarray
     dt: np.ndarray
     ray: np.ndarray
+    marched: int
     features: np.ndarray
     jacobians: list[np.ndarray]
     composited: Composited
