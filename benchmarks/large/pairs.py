@@ -24,8 +24,9 @@ from numpy.typing import NDArray
 
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.model.dataset import Dataset
-from biresnerf.data.model.image_order import natural_order, pose_distances
-from biresnerf.data.photos.alike.image_likeness import likeness
+from biresnerf.data.model.image_distances import nearest_pairs, pose_distances
+from biresnerf.data.model.image_order import natural_order
+from biresnerf.data.photos.alike.image_likeness import unlikeness
 from biresnerf.data.seeding.colmap_child import DATABASE, extract_features, extraction_options, import_images
 from biresnerf.data.seeding.colmap_pairs import likeliest_pairs, match_features
 from biresnerf.data.seeding.map_images import (
@@ -34,7 +35,6 @@ from biresnerf.data.seeding.map_images import (
     LIKELIEST,
     NEIGHBOURS,
     lay_out,
-    nearest_pairs,
     thoroughness,
 )
 from biresnerf.geometry.perturb import perturb_poses
@@ -80,7 +80,7 @@ def chosen(
     index = {name: int(Path(name).stem) for name in names}
     by_name = {i: name for name, i in index.items()}
     noisy = perturb_poses(dataset.world_from_cam, noise, seed=seed)
-    near = nearest_pairs(pose_distances(noisy), NEIGHBOURS)
+    near = nearest_pairs(pose_distances(noisy), len(noisy), NEIGHBOURS)
     listed = [(by_name[a], by_name[b]) for a, b in sorted(near)]
     likeliest = {(index[a], index[b]) for a, b in likeliest_pairs(database, listed, LIKELIEST)}
     order = natural_order(dataset.names)
@@ -89,7 +89,7 @@ def chosen(
         for step in range(1, BY_NAME + 1)
         for a, b in zip(order, order[step:], strict=False)
     }
-    alike = nearest_pairs(-likeness(dataset).astype(np.float64), BY_LIKENESS)
+    alike = nearest_pairs(unlikeness(dataset), len(dataset), BY_LIKENESS)
     return {
         f"{NEIGHBOURS} nearest by given poses": near,
         f"of these {LIKELIEST} by coarse features": {(min(p), max(p)) for p in likeliest},

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.geometry.focus import focus_point
+from biresnerf.data.model.image_distances import distances_in_order, pose_distances, typical_distance
 
 # Photos are taken one after the other along a path if neighbours by name stand this much nearer than any two do.
 STEP_SHARE = 0.5
@@ -68,20 +68,6 @@ def taken_along_a_path(world_from_cam: NDArray[np.float64]) -> bool:
     """Whether poses [n, 4, 4], in the order of names, follow each other far closer than any two of them do."""
     if len(world_from_cam) < LEAST_POSED:
         return False
-    apart = pose_distances(world_from_cam)
-    steps = np.diagonal(apart, offset=1)
-    return float(np.median(steps)) < STEP_SHARE * float(np.median(apart[np.triu_indices(len(apart), 1)]))
-
-
-def pose_distances(world_from_cam: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How far any two poses [n, n] are apart: their centres, in distances of the scene, and their viewing axes."""
-    centres = world_from_cam[:, :3, 3] / max(focus_point(world_from_cam).mean_distance, 1e-12)
-    return _between_any(centres) + _between_any(world_from_cam[:, :3, 2])
-
-
-def _between_any(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distances [n, n] between points [n, 3], coordinate by coordinate: of thousands, [n, n, 3] is too large."""
-    squared = np.zeros((len(points), len(points)))
-    for values in points.T:
-        squared += (values[:, None] - values) ** 2
-    return np.asarray(np.sqrt(squared))
+    apart, images = pose_distances(world_from_cam), len(world_from_cam)
+    step = float(np.median(distances_in_order(apart, images)))
+    return step < STEP_SHARE * typical_distance(apart, images)

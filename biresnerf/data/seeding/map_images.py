@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from biresnerf.data.model.dataset import Dataset
-from biresnerf.data.model.image_order import natural_order, pose_distances
-from biresnerf.data.photos.alike.image_likeness import likeness
+from biresnerf.data.model.image_distances import nearest_pairs, pose_distances
+from biresnerf.data.model.image_order import natural_order
+from biresnerf.data.photos.alike.image_likeness import unlikeness
 from biresnerf.data.photos.decode import decode
 from biresnerf.data.photos.image_files import is_plain, quiet_pillow
 from biresnerf.data.photos.images import decoding_threads
@@ -95,7 +96,7 @@ class Mapping:
 
     Attributes:
         models: the best first.
-        matches: how many features [n, n] any two images have in common.
+        matches: pairs of images, and how many features they have in common [m, 3].
         still: whether matches were left out that stay where they are while others move.
     """
 
@@ -297,20 +298,12 @@ def _pairs(dataset: Dataset, names: list[str]) -> list[tuple[str, str]] | None:
 def likely_pairs(dataset: Dataset) -> set[tuple[int, int]]:
     """Pairs of photos, by row, that may show the same: by given poses where all have one, else by looks and names."""
     if dataset.posed.all():
-        return nearest_pairs(pose_distances(dataset.world_from_cam), NEIGHBOURS)
-    pairs = nearest_pairs(-likeness(dataset).astype(np.float64), BY_LIKENESS)
+        return nearest_pairs(pose_distances(dataset.world_from_cam), len(dataset), NEIGHBOURS)
+    pairs = nearest_pairs(unlikeness(dataset), len(dataset), BY_LIKENESS)
     order = natural_order(dataset.names)
     for step in range(1, BY_NAME + 1):
         pairs |= {(min(a, b), max(a, b)) for a, b in zip(order, order[step:], strict=False)}
     return pairs
-
-
-def nearest_pairs(apart: NDArray[np.float64], count: int) -> set[tuple[int, int]]:
-    """Each of n with its `count` nearest by the distances [n, n]."""
-    apart = apart.copy()
-    np.fill_diagonal(apart, np.inf)
-    nearest = np.argsort(apart, axis=1, kind="stable")[:, : min(count, len(apart) - 1)]
-    return {(min(i, int(j)), max(i, int(j))) for i in range(len(apart)) for j in nearest[i]}
 
 
 def read_mapping(dataset: Dataset, answer: dict[str, Any]) -> Mapping:
@@ -321,11 +314,9 @@ def read_mapping(dataset: Dataset, answer: dict[str, Any]) -> Mapping:
     """
     index = {name: i for i, name in enumerate(numbered_names(dataset))}
     models = [_model(model, index) for model in answer["models"]]
-    matches = np.zeros((len(dataset), len(dataset)), dtype=np.int64)
-    for a, b, count in answer["matches"]:
-        matches[index[a], index[b]] = matches[index[b], index[a]] = count
+    matches = [(index[a], index[b], count) for a, b, count in answer["matches"]]
     best_first = sorted(models, key=lambda m: (-len(m.rows), -m.observations / max(m.reprojection_px, 0.1)))
-    return Mapping(tuple(best_first), matches, answer.get("still", False))
+    return Mapping(tuple(best_first), np.array(matches, np.int64).reshape(-1, 3), answer.get("still", False))
 
 
 def _model(found: dict[str, Any], index: dict[str, int]) -> MappedModel:

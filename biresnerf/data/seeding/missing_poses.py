@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.data.model.image_distances import Distances
 from biresnerf.data.model.image_order import natural_order, taken_along_a_path
 from biresnerf.data.model.measured_places import PositionPriors
 from biresnerf.geometry.body_offset import MAXWELL_MEDIAN, tie
@@ -55,7 +56,7 @@ def guess_missing(
     known: NDArray[np.bool_],
     names: Sequence[str],
     matches: NDArray[np.int64],
-    likeness: Callable[[], NDArray[np.float32]],
+    unlikeness: Callable[[], Distances],
 ) -> list[PoseSource | None]:
     """Fills poses [n, 4, 4] that are not ``known`` [n], in place; says how, None for known ones.
 
@@ -64,8 +65,8 @@ def guess_missing(
     alike.
 
     Args:
-        matches: how many features [n, n] any two images have in common.
-        likeness: called only if it is needed; see `image_likeness.likeness`.
+        matches: pairs of images, and how many features they have in common [m, 3].
+        unlikeness: called only if it is needed; see `image_likeness.unlikeness`.
 
     Raises:
         ValueError: no pose is known.
@@ -77,22 +78,31 @@ def guess_missing(
         return sources
     order = natural_order(names)
     on_path = taken_along_a_path(world_from_cam[[i for i in order if known[i]]])
-    alike: NDArray[np.float32] | None = None
+    unlike: Distances | None = None
     for place, image in enumerate(order):
         if known[image]:
             continue
         pose = _on_path(world_from_cam, known, order, place) if on_path else None
         sources[image] = "neighbours"
         if pose is None:
-            shared = np.where(known, matches[image], 0)
+            shared = np.where(known, _in_common(image, matches, len(known)), 0)
             if shared.max() > 0:
                 nearest = int(np.argmax(shared))
             else:
-                alike = likeness() if alike is None else alike
-                nearest = int(np.argmax(np.where(known, alike[image], -np.inf)))
+                unlike = unlike or unlikeness()
+                nearest = int(np.argmin(np.where(known, unlike(np.array([image]))[0], np.inf)))
             pose, sources[image] = world_from_cam[nearest].copy(), "nearest-view"
         world_from_cam[image] = pose
     return sources
+
+
+def _in_common(image: int, matches: NDArray[np.int64], images: int) -> NDArray[np.int64]:
+    """How many features an image has in common with each other one [n]."""
+    found = np.zeros(images, np.int64)
+    for own, other in ((0, 1), (1, 0)):
+        of_image = matches[matches[:, own] == image]
+        found[of_image[:, other]] = of_image[:, 2]
+    return found
 
 
 def _on_path(

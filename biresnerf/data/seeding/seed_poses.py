@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from biresnerf.data.formats.positions.position_priors import position_priors
 from biresnerf.data.model.dataset import GUESSES, Cut, Dataset
-from biresnerf.data.photos.alike.image_likeness import likeness
+from biresnerf.data.model.image_distances import typical_distance
+from biresnerf.data.photos.alike.image_likeness import unlikeness
 from biresnerf.data.photos.alike.turning_object import turning_notes
 from biresnerf.data.photos.named_images import MIN_IMAGES
 from biresnerf.data.photos.orientation import shown_from_cam
@@ -108,7 +109,7 @@ class _Given:
             placed | self.posed | measured,
             self.dataset.names,
             matches,
-            cache(lambda: likeness(self.dataset)),
+            cache(lambda: unlikeness(self.dataset)),
         )
         sources: list[PoseSource] = ["given"] * len(poses)
         for i, guess in enumerate(guessed):
@@ -318,9 +319,8 @@ def _facing_forward(given: _Given, what: str) -> Seeding:
     if (measured := _by_gimbal(given)) is not None:
         notes = (*dataset.warnings, f"{what}: {BY_GIMBAL}", *turning_notes(dataset))
         return _seeding(replace(dataset, warnings=notes), measured)
-    alike = likeness(dataset)
-    pairs, turns = alike[np.triu_indices(len(alike), 1)], turning_notes(dataset)
-    if float(np.median(pairs)) < FACING_ALIKE:
+    alike, turns = 1 - typical_distance(unlikeness(dataset), len(dataset)), turning_notes(dataset)
+    if alike < FACING_ALIKE:
         raise InputError(
             "insufficient_overlap",
             f"{what}, and the photos are too different to have been taken from nearly one place.",

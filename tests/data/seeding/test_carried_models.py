@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from biresnerf.data.model.image_order import pose_distances
-from biresnerf.data.seeding.map_images import MappedModel, nearest_pairs
+from biresnerf.data.model.image_distances import nearest_pairs, pose_distances
+from biresnerf.data.seeding.map_images import MappedModel
 from biresnerf.data.seeding.match_poses import STRAY_SHARE, carry_model
 from biresnerf.geometry.focus import focus_point
 from biresnerf.geometry.perturb import perturb_poses
@@ -79,4 +79,4 @@ def test_many_images_are_matched_with_those_that_see_nearly_the_same():
         pose[:3, :3] = np.stack([np.cross(down, forward), down, forward], 1)
         pose[:3, 3] = -4 * forward
     ring = {tuple(sorted((i, (i + 1) % 8))) for i in range(8)}
-    assert nearest_pairs(pose_distances(poses), 2) == ring
+    assert nearest_pairs(pose_distances(poses), 8, 2) == ring

@@ -8,7 +8,7 @@ from PIL import Image
 
 from biresnerf.data.model.dataset import Dataset, Frame, SourceFormat
 from biresnerf.data.model.image_order import natural_order, taken_along_a_path
-from biresnerf.data.photos.alike.image_likeness import likeness
+from biresnerf.data.photos.alike.image_likeness import unlikeness
 from biresnerf.data.seeding.missing_poses import guess_missing
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.pose_error import rotation_between_deg
@@ -21,14 +21,13 @@ def nobody_asked() -> np.ndarray:
     raise AssertionError("photos need not be looked at")
 
 
-def guess(poses: np.ndarray, missing: list[int], names=None, matches=None, alike=nobody_asked):
+def guess(poses: np.ndarray, missing: list[int], names=None, matches=(), unlike=nobody_asked):
     known = np.ones(len(poses), dtype=bool)
     known[missing] = False
     found = poses.copy()
     found[missing] = np.eye(4)
     names = names or [f"IMG_{i + 98}.jpg" for i in range(len(poses))]
-    nothing = np.zeros((len(poses), len(poses)), dtype=np.int64)
-    sources = guess_missing(found, known, names, nothing if matches is None else matches, alike)
+    sources = guess_missing(found, known, names, np.array(matches, np.int64).reshape(-1, 3), unlike)
     np.testing.assert_array_equal(found[known], poses[known])
     return found, sources
 
@@ -69,9 +68,9 @@ def test_beyond_the_end_of_a_path_the_last_pose_is_taken():
 def test_without_a_path_the_image_with_most_features_in_common_lends_its_pose():
     order = np.random.default_rng(0).permutation(VIEWS)
     poses = arc_poses(VIEWS)[order]
-    matches = np.zeros((VIEWS, VIEWS), dtype=np.int64)
-    matches[3, 5], matches[3, 6], matches[3, 9] = 20, 90, 40
-    found, sources = guess(poses, [3, 6], matches=matches, alike=lambda: np.eye(VIEWS, dtype=np.float32))
+    matches = [(3, 5, 20), (3, 6, 90), (9, 3, 40)]
+    nothing_alike = 1 - np.eye(VIEWS)
+    found, sources = guess(poses, [3, 6], matches=matches, unlike=lambda: lambda rows: nothing_alike[rows])
     np.testing.assert_array_equal(found[3], poses[9])  # 6 has no pose itself
     assert sources[3] == "nearest-view"
 
@@ -83,12 +82,12 @@ def test_without_features_the_photo_that_looks_most_alike_lends_its_pose(tmp_pat
     frames = tuple(Frame(p.name, p, 0, None, None) for p in paths)
     camera = Camera("SIMPLE_PINHOLE", 64, 64, (64.0, 32.0, 32.0))
     dataset = Dataset(tmp_path, (camera,), frames, SourceFormat("images", None, {}, np.eye(4)))
-    found, sources = guess(poses, [2, 8], alike=lambda: likeness(dataset))
+    found, sources = guess(poses, [2, 8], unlike=lambda: unlikeness(dataset))
     assert sources[2] == sources[8] == "nearest-view"
     assert rotation_between_deg(found, poses)[[2, 8]].max() < 17  # neighbours on the arc are 8 degrees apart
 
 
-def test_likeness_is_one_with_itself_and_nothing_for_a_blank_photo(tmp_path):
+def test_a_photo_is_like_itself_and_its_copies_and_a_blank_one_like_none(tmp_path):
     write_image(tmp_path / "a.png", 1, (96, 72))
     Image.open(tmp_path / "a.png").resize((48, 36), Image.Resampling.BOX).save(tmp_path / "b.png")
     Image.new("RGB", (96, 72), (90, 90, 90)).save(tmp_path / "c.png")
@@ -98,11 +97,12 @@ def test_likeness_is_one_with_itself_and_nothing_for_a_blank_photo(tmp_path):
     )
     frames = tuple(Frame(f"{n}.png", tmp_path / f"{n}.png", 0, None, None) for n in "abcde")
     camera = Camera("SIMPLE_PINHOLE", 96, 72, (60.0, 48.0, 36.0))
-    alike = likeness(Dataset(tmp_path, (camera,), frames, SourceFormat("images", None, {}, np.eye(4))))
-    np.testing.assert_allclose(np.diag(alike), 1, atol=1e-6)
+    unlike = unlikeness(Dataset(tmp_path, (camera,), frames, SourceFormat("images", None, {}, np.eye(4))))
+    alike = 1 - unlike(np.arange(5))
+    np.testing.assert_allclose(np.diag(alike)[[0, 1, 3, 4]], 1, atol=1e-6)
     assert alike[0, 1] > 0.9
     assert alike[0, 4] > 0.999  # the same in 16 bit
-    np.testing.assert_array_equal(alike[2, [0, 1, 3, 4]], 0)
+    np.testing.assert_array_equal(alike[2], 0)
 
 
 def test_without_any_pose_there_is_nothing_to_guess_from():

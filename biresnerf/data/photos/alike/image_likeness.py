@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.model.image_distances import Distances
 from biresnerf.data.photos.area_resize import area_resize
 from biresnerf.data.photos.image_files import is_sixteen_bit, open_image, quiet_pillow
 from biresnerf.data.photos.kinds.sixteen_bit import as_eight_bit
@@ -18,19 +19,17 @@ _DRAFT = 8 * SIDE  # px that a JPEG is decoded at
 _DECODERS = 4
 
 
-def likeness(dataset: Dataset) -> NDArray[np.float32]:
-    """Normalised correlation [n, n] of the photos in grey, each shrunk to 24 x 24 px: 1 on the diagonal, -1 at least.
+def unlikeness(dataset: Dataset) -> Distances:
+    """One minus the normalised correlation of the photos in grey, each shrunk to 24 x 24 px: 0 to 2.
 
-    A photo of one colour is like no other (0). Raises `InputError` as `open_image` does.
+    A photo of one colour is like no other (1). Raises `InputError` as `open_image` does.
     """
     small = thumbnails(dataset, range(len(dataset)))
     small = small.reshape(len(small), -1)
     small = small - small.mean(1, keepdims=True)
     lengths = np.linalg.norm(small, axis=1, keepdims=True)
     unit = np.divide(small, lengths, out=np.zeros_like(small), where=lengths > 1e-6)
-    alike: NDArray[np.float32] = unit @ unit.T
-    np.fill_diagonal(alike, 1.0)
-    return alike
+    return lambda rows: 1 - unit[rows] @ unit.T
 
 
 def thumbnails(dataset: Dataset, indices: Sequence[int]) -> NDArray[np.float32]:

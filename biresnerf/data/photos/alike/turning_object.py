@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.model.dataset import Dataset
+from biresnerf.data.model.image_distances import Distances, distances_in_order, typical_distance
 from biresnerf.data.model.image_order import natural_order
 from biresnerf.data.photos.alike.image_likeness import thumbnails
 
@@ -26,21 +27,24 @@ def goes_round(grey: NDArray[np.float32]) -> bool:
     """Whether photos, shrunk, in grey and in order [n, h, w], resemble their neighbours and the last one the first."""
     if len(grey) < LEAST_PHOTOS:
         return False
-    apart = _apart(grey)
-    steps = np.diagonal(apart, offset=1)
-    typical = float(np.median(steps))
-    any_two = float(np.median(apart[np.triu_indices(len(apart), 1)]))
-    return typical < NEIGHBOUR_SHARE * any_two and float(apart[-1, 0]) < (typical + any_two) / 2
+    apart, images = _differences(grey), len(grey)
+    typical = float(np.median(distances_in_order(apart, images)))
+    any_two = typical_distance(apart, images)
+    first_to_last = float(apart(np.array([0]))[0, -1])
+    return typical < NEIGHBOUR_SHARE * any_two and first_to_last < (typical + any_two) / 2
 
 
-def _apart(grey: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Root mean squared difference [n, n] of photos [n, h, w]."""
+def _differences(grey: NDArray[np.float32]) -> Distances:
+    """Root mean squared differences of photos [n, h, w]."""
     flat = grey.reshape(len(grey), -1).astype(np.float64)
     own = (flat**2).sum(1)
-    # By products: the differences themselves would take gigabytes for a thousand photos.
-    squared = own[:, None] + own[None] - 2 * flat @ flat.T
-    np.fill_diagonal(squared, 0.0)
-    return np.sqrt(np.maximum(squared, 0.0) / flat.shape[1])
+
+    def to_all(rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        # By products: the differences themselves would take gigabytes for a thousand photos.
+        squared = own[rows, None] + own - 2 * flat[rows] @ flat.T
+        return np.asarray(np.sqrt(np.maximum(squared, 0.0) / flat.shape[1]))
+
+    return to_all
 
 
 def still_surroundings(grey: NDArray[np.float32]) -> bool:
