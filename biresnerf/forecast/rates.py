@@ -22,8 +22,8 @@ _REMEMBERED = TypeAdapter(dict[str, dict[str, list[PositiveFloat]]])
 KEPT = 5
 # A rate that is further from the general one is not believed. No general rates of GPUs are known.
 CREDIBLE = 3.0
-# How far general rates may be off: the time on this machine over theirs. Two hosts of the same kind took 2/3 and 3/2.
-UNKNOWN = (2 / 3, 2.0)
+# How far general rates may be off: the time on this machine over theirs. Three hosts took 2/3, 3/2 and 3.
+UNKNOWN = (2 / 3, 3.0)
 
 
 @dataclass(frozen=True)
