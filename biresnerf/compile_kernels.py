@@ -41,7 +41,7 @@ from biresnerf.refinement.optimise.renderer import cast_rays, viewing_directions
 from biresnerf.refinement.parameters.pose_parameters import PoseParameters
 
 SIZE, BASELINE = 32, 0.125  # px, and as a share of the distance to the scene: four pixels
-RATES = FieldRates(1e-3, 1e-3, (1e-3,) * 2, 1e-3)
+FIELD_RATES = FieldRates(1e-3, 1e-3, (1e-3,) * 2, 1e-3)
 
 
 class KernelCompilation:
@@ -64,7 +64,7 @@ class KernelCompilation:
         self._field = field
         if _stamp(field).exists():
             return False
-        for part in ("render", "gradients", "adjustment") if field else ("adjustment",):
+        for part in PARTS if field else ("adjustment",):
             command = [sys.executable, "-m", "biresnerf.compile_kernels", part]
             self._children.append(
                 subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
@@ -113,7 +113,7 @@ def compile_field_kernels() -> None:
     """Run every kernel once on a tiny field, as a step does."""
     field, colour = _render_one_ray()
     colour.sum().backward()
-    field.step(RATES)
+    field.step(FIELD_RATES)
 
 
 def _render_one_ray() -> tuple[CpuField, torch.Tensor]:
@@ -141,16 +141,13 @@ def _tiny_field() -> CpuField:
 def compile_backward_kernels() -> None:
     """Run the kernels of the field's backward pass and of its update, and none of its forward pass."""
     field, none = _tiny_field(), np.zeros((1, 3), np.float32)
-    samples, view, one = (
-        field.unseen_sample(),
-        np.zeros((1, VIEW_FEATURES), np.float32),
-        np.ones(1, np.float32),
-    )
+    view, one = np.zeros((1, VIEW_FEATURES), np.float32), np.ones(1, np.float32)
+    samples = field.unseen_sample()
     dx, g_view = field.render_backward(samples, view, none, one, none, one, PositionGradient())
     g_origin, g_direction = np.empty_like(none), np.empty_like(none)
     ray_gradients(none, none, samples.offset, samples.t, dx, field.shape.unbounded, g_origin, g_direction)
     add_harmonics_gradient(none, g_view, g_direction)
-    field.step(RATES)
+    field.step(FIELD_RATES)
 
 
 @cache
@@ -193,20 +190,22 @@ def _adjust_two_cameras() -> None:
     misfit(poses, evidence, 1.0)
 
 
-def _compile_part(part: str) -> None:
-    """Compile one of three parts that take about equally long, and share few kernels."""
-    if part == "render":
-        _render_one_ray()
-    elif part == "gradients":
-        compile_backward_kernels()
-        _cast_one_ray()
-    else:
-        _adjust_two_cameras()
+def _step_back() -> None:
+    """What a step runs beside rendering: its pixels' rays and the gradients."""
+    compile_backward_kernels()
+    _cast_one_ray()
 
+
+# They take about equally long, and share few kernels.
+PARTS: dict[str, Callable[[], object]] = {
+    "render": _render_one_ray,
+    "gradients": _step_back,
+    "adjustment": _adjust_two_cameras,
+}
 
 if __name__ == "__main__":
     if len(sys.argv) > 1:
-        _compile_part(sys.argv[1])
+        PARTS[sys.argv[1]]()
     else:
         with KernelCompilation() as compilation:
             compilation.start(field=True)

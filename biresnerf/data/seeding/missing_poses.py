@@ -90,7 +90,8 @@ def guess_missing(
                 nearest = int(np.argmax(shared))
             else:
                 unlike = unlike or unlikeness()
-                nearest = int(np.argmin(np.where(known, unlike(np.array([image]))[0], np.inf)))
+                others = np.flatnonzero(known)
+                nearest = int(others[unlike(np.array([image]), others)[0].argmin()])
             pose, sources[image] = world_from_cam[nearest].copy(), "nearest-view"
         world_from_cam[image] = pose
     return sources

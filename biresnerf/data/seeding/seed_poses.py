@@ -6,7 +6,6 @@ import logging
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -109,7 +108,7 @@ class _Given:
             placed | self.posed | measured,
             self.dataset.names,
             matches,
-            cache(lambda: unlikeness(self.dataset)),
+            lambda: unlikeness(self.dataset),
         )
         sources: list[PoseSource] = ["given"] * len(poses)
         for i, guess in enumerate(guessed):

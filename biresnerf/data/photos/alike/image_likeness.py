@@ -22,14 +22,14 @@ _DECODERS = 4
 def unlikeness(dataset: Dataset) -> Distances:
     """One minus the normalised correlation of the photos in grey, each shrunk to 24 x 24 px: 0 to 2.
 
-    A photo of one colour is like no other (1). Raises `InputError` as `open_image` does.
+    A photo of one colour is like no other (1), but itself. Raises `InputError` as `open_image` does.
     """
     small = thumbnails(dataset, range(len(dataset)))
     small = small.reshape(len(small), -1)
     small = small - small.mean(1, keepdims=True)
     lengths = np.linalg.norm(small, axis=1, keepdims=True)
     unit = np.divide(small, lengths, out=np.zeros_like(small), where=lengths > 1e-6)
-    return lambda rows: 1 - unit[rows] @ unit.T
+    return lambda some, others: np.where(some[:, None] == others, 0, 1 - unit[some] @ unit[others].T)
 
 
 def thumbnails(dataset: Dataset, indices: Sequence[int]) -> NDArray[np.float32]:

@@ -30,7 +30,7 @@ def goes_round(grey: NDArray[np.float32]) -> bool:
     apart, images = _differences(grey), len(grey)
     typical = float(np.median(distances_in_order(apart, images)))
     any_two = typical_distance(apart, images)
-    first_to_last = float(apart(np.array([0]))[0, -1])
+    first_to_last = float(apart(np.array([0]), np.array([images - 1]))[0, 0])
     return typical < NEIGHBOUR_SHARE * any_two and first_to_last < (typical + any_two) / 2
 
 
@@ -39,12 +39,12 @@ def _differences(grey: NDArray[np.float32]) -> Distances:
     flat = grey.reshape(len(grey), -1).astype(np.float64)
     own = (flat**2).sum(1)
 
-    def to_all(rows: NDArray[np.int64]) -> NDArray[np.float64]:
+    def between(some: NDArray[np.int64], others: NDArray[np.int64]) -> NDArray[np.float64]:
         # By products: the differences themselves would take gigabytes for a thousand photos.
-        squared = own[rows, None] + own - 2 * flat[rows] @ flat.T
+        squared = own[some, None] + own[others] - 2 * flat[some] @ flat[others].T
         return np.asarray(np.sqrt(np.maximum(squared, 0.0) / flat.shape[1]))
 
-    return to_all
+    return between
 
 
 def still_surroundings(grey: NDArray[np.float32]) -> bool:
