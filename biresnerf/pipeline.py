@@ -140,7 +140,9 @@ def _refine(input: str | Path | Dataset, setup: _Setup, observer: Observer, star
     stages = _first_step(scene, origin, setup, observer)
     optimiser, run = stages.optimiser, stages.run
     WorkAhead(scene, optimiser, run).keep_to_budget(started, setup.recipe.options.steps)
-    run.spent("preparing", time.monotonic() - started)
+    run.spent("preparing", time.monotonic() - started - setup.kernels.waited_s)
+    if setup.kernels.waited_s:
+        run.spent("compiling", setup.kernels.waited_s)
 
     evaluation, judgement = Evaluation(), None
 

@@ -319,7 +319,9 @@ class Report(FrozenModel):
     switch_reason: SwitchReason | None = Field(None, examples=["stable"])
     resumed: int = Field(0, description="How often the run went on from a checkpoint.")
     seconds: dict[str, float] = Field(
-        default_factory=dict, examples=[{"coarse": 40.1, "fine": 71.9}], description="Wall time per stage."
+        default_factory=dict,
+        examples=[{"coarse": 40.1, "fine": 71.9}],
+        description="Wall time per stage; `compiling` is the wait for kernels in the first run on a machine.",
     )
     backend: str = Field(examples=["numba"])
     device: str = Field(examples=["cpu"])

@@ -1,5 +1,6 @@
 """The first run on a machine: other processes compile its kernels while it reads photos, and later runs need none."""
 
+import json
 import os
 import re
 import subprocess
@@ -39,6 +40,13 @@ def test_a_run_compiles_nothing_itself_and_the_next_starts_no_process_for_it(tmp
     assert "compiles kernels" in first.stderr
     (stamp,) = (tmp_path / "kernels").glob("compiled-*")
     assert re.search(r"compiled (\d+)", first.stdout)[1] == "0", first.stdout
+    assert waits(tmp_path / "first"), "the wait is a part of the run's time"
     second = run(tmp_path / "second")
     assert "compiles kernels" not in second.stderr
     assert stamp.exists()
+    assert not waits(tmp_path / "second")
+
+
+def waits(output: Path) -> bool:
+    """Whether the report tells of time spent on waiting for kernels."""
+    return json.loads((output / "report.json").read_text())["seconds"].get("compiling", 0.0) > 0

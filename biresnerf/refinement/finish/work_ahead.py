@@ -145,7 +145,10 @@ def budget_warnings(budget_s: float, spent: Mapping[str, float]) -> tuple[str, .
     total = sum(spent.values())
     if not budget_s or total <= OVERDRAWN * budget_s:
         return ()
-    return (
-        f"The run took {total:.0f} s of a budget of {budget_s:g} s, {spent.get('preparing', 0.0):.0f} s of them "
-        "before the first step. Give it more time, or fewer or smaller photos.",
-    )
+    compiling = spent.get("compiling", 0.0)
+    before = f"{spent.get('preparing', 0.0) + compiling:.0f} s of them before the first step"
+    advice = "Give it more time, or fewer or smaller photos."
+    if compiling:
+        waited = f"{compiling:.0f} s of waiting"
+        advice = f"The first run on a machine compiles kernels ({waited}): the next one has that time."
+    return (f"The run took {total:.0f} s of a budget of {budget_s:g} s, {before}. {advice}",)

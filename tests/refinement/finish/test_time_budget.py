@@ -122,6 +122,16 @@ def test_a_run_without_time_ends_early_and_says_what_it_took(scene, tmp_path):
     assert "of a budget of 0.01 s" in warning
 
 
+def test_a_run_late_because_kernels_were_compiled_says_so():
+    spent = {"preparing": 88.0, "compiling": 60.0, "coarse": 30.0, "fine": 49.0}
+    (warning,) = budget_warnings(120.0, spent)
+    assert "took 227 s of a budget of 120 s, 148 s of them before the first step" in warning
+    assert "compiles kernels (60 s of waiting)" in warning
+    del spent["compiling"]
+    (warning,) = budget_warnings(120.0, spent)
+    assert warning.endswith("Give it more time, or fewer or smaller photos.")
+
+
 @pytest.mark.slow
 def test_a_run_without_a_budget_takes_all_its_steps(scene, tmp_path):
     run = begun(scene, tmp_path, steps=60, coarse_steps_min=10, coarse_steps_max=20)
