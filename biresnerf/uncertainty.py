@@ -126,6 +126,9 @@ class KnownScale(FrozenModel, allow_inf_nan=False):
 WEAK = 0.5  # of the photos at a seam; more are within honest bounds
 
 
+NOT_REFINED = "part.json"  # in the place of a part's result: a `PartReport` that says why there is none
+
+
 class PartReport(FrozenModel):
     """A part of a large set that was refined by itself."""
 

@@ -20,6 +20,8 @@ PRIORITIES: dict[PriorityName, int] = {"low": -1, "normal": 0, "high": 1}
 # Files of a result that the engine uses.
 LOG_NAME, POSES_NAME, REPORT_NAME = "log.txt", "poses.json", "report.json"
 CRASH_NAME = "crash.txt"  # beside the log, for the operator alone
+# With this exit status, a job's process asks for jobs with the options in this file, whose results it then joins.
+EXIT_SPLIT, SPLIT_NAME = 6, "split.json"
 THUMBNAIL_NAME = "thumbnail.jpg"
 PREVIEW_FOLDER = "preview"  # of files that show a job's progress
 # What pages show of a dataset: beside the folder that is checked, and in the file store.

@@ -111,6 +111,7 @@ class Client:
     share = _blocking(AsyncClient.share)
     export = _blocking(AsyncClient.export)
     exports = _blocking(AsyncClient.exports)
+    parts = _blocking(AsyncClient.parts)
 
     create_webhook = _blocking(AsyncClient.create_webhook)
     webhook = _blocking(AsyncClient.webhook)

@@ -137,6 +137,10 @@ class JobCalls(Transport):
         """All exports of the job, oldest first."""
         return list(parse(await self._ask(Call("GET", f"{job_url(job_id)}/exports")), JobList).items)
 
+    async def parts(self, job_id: str) -> list[JobView]:
+        """The jobs that a job on a large set has split itself into, in order."""
+        return list(parse(await self._ask(Call("GET", f"{job_url(job_id)}/parts")), JobList).items)
+
     async def deliver(self, job_id: str, to: DeliverTo) -> JobView:
         """Has files of the job sent to addresses, now or once it is over; ``delivered`` says what became of them."""
         call = Call("POST", f"{job_url(job_id)}/deliver", json=to.model_dump(mode="json"))

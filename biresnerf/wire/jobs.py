@@ -33,6 +33,8 @@ EventType = Literal[
     "attempt_crashed",
     "retried_smaller",
     "requeued",
+    "split",
+    "part_over",
     "cancel_requested",
     "succeeded",
     "failed",
@@ -69,6 +71,14 @@ class JobUse(Record):
     )
 
 
+class JobParts(Record):
+    """Into how many jobs a job has split itself, and how many of them are over."""
+
+    parts: int = Field(examples=[8])
+    over: int = Field(examples=[3])
+    failed: int = Field(0, description="Of those that are over, without a result.")
+
+
 class JobLinks(Links):
     """Paths of the parts of a job."""
 
@@ -79,6 +89,7 @@ class JobLinks(Links):
     images: str
     logs: str
     exports: str
+    parts: str
     cancel: str
     deliver: str
     fork: str
@@ -95,7 +106,11 @@ class JobView(Record):
         description="The API key that submitted it; null without one.",
     )
     kind: JobKind = Field("refine", description="`export` writes the result of `parent` in further forms.")
-    parent: str | None = Field(None, description="The job whose result an export writes.")
+    parent: str | None = Field(
+        None,
+        description="The job whose result an export writes, or that has split itself into this and others.",
+    )
+    parts: JobParts | None = Field(None, description="Null unless the job has split itself.")
     forked_from: str | None = Field(None, description="The job that this one was forked from.")
     forked_stage: ReusableStage | None = Field(
         None, description="The stage of that job whose result was reused."
@@ -207,6 +222,13 @@ class JobTexts(Record):
         description="Where its files are sent once it is over. A repeated request with the same key keeps the first "
         "addresses.",
     )
+    part_photos: int | None = Field(
+        None,
+        ge=20,
+        le=10_000,
+        description="A job on more photos splits itself into jobs on about so many each, which any workers run; it "
+        "waits for them, and joins their results. Left out: as the operator has set.",
+    )
     priority: PriorityName = Field(
         "normal", description="Before or after other jobs; `high` only where the operator allows it."
     )
@@ -231,6 +253,7 @@ class JobDetails(TypedDict, total=False):
         webhook: where messages about it go.
         deliver: where its files are sent once it is over; see `biresnerf.client.bucket_target`.
         fixed_from: a job with a result of some of the photos: they keep its poses and lenses, others join its frame.
+        part_photos: a job on more photos splits itself into parts of about so many.
         expires_in_queue_s: seconds from the submission, after which it is not started any more.
         deadline_at: when it is stopped, with its best poses so far.
     """
@@ -239,6 +262,7 @@ class JobDetails(TypedDict, total=False):
     webhook: JobWebhook | None
     deliver: DeliverTo | None
     fixed_from: str | None
+    part_photos: int | None
     expires_in_queue_s: int | None
     deadline_at: datetime | None
 

@@ -1,4 +1,4 @@
-"""What is made from a job: its log, the table of its images, forks and exports."""
+"""What is made from a job: its log, the table of its images, forks, exports and parts."""
 
 from __future__ import annotations
 
@@ -147,6 +147,16 @@ async def export_job(job_id: JobId, caller: JobWriter, body: NewExport) -> Respo
 async def list_exports(job_id: JobId, caller: ReadCaller) -> JobList:
     """All exports of the job, the oldest first."""
     page = await _derived(caller).exports(job_id)
+    return JobList(items=page.items)
+
+
+@router.get("/parts")
+async def list_parts(job_id: JobId, caller: ReadCaller) -> JobList:
+    """The jobs that a job on a large set has split itself into, in order; none for most jobs.
+
+    Each is an ordinary job on some of the photos, and cancelled with the whole.
+    """
+    page = await _derived(caller).parts(job_id)
     return JobList(items=page.items)
 
 

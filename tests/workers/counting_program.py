@@ -26,6 +26,15 @@ stopping = []
 signal.signal(signal.SIGTERM, lambda *_: stopping.append(True))
 
 
+whole = not order["options"].get("photos")
+if whole and "parts" not in order and plan.get("parts"):
+    asked = [{**order["options"], "photos": [f"{n}.jpg"], "verdict": False} for n in range(plan["parts"])]
+    (folder / "split.json").write_text(json.dumps(asked))
+    sys.exit(6)
+if not whole and order["options"]["photos"][0] in plan.get("bad_parts", ()):
+    plan["refuse"] = True
+
+
 def tell(step: int, stage: str = "coarse", **reported: Any) -> None:
     total = plan["steps"]
     progress = Progress(
@@ -59,6 +68,7 @@ with open(plan["journal"], "a") as journal:
     device = os.environ.get("CUDA_VISIBLE_DEVICES")
     said = {
         "pid": os.getpid(), "from": start, "database": knows_database, "at": time.time(), "device": device,
+        "photos": order["options"].get("photos", []),
     }  # fmt: skip
     journal.write(json.dumps(said) + "\n")
 sys.stderr.write(f"counting from {start}\n")
@@ -110,7 +120,11 @@ for step in range(start + 1, plan["steps"] + 1):
         (output / "poses.json").write_text(json.dumps({"step": step}))
         (output / "report.json").write_text(json.dumps({"state": "partial", "steps": step}))
         sys.exit(143)
-(output / "report.json").write_text(json.dumps({"steps": plan["steps"], "from": start, "chain": chain}))
+joined = {
+    part.name: sorted(path.name for path in part.iterdir()) for part in sorted((folder / "parts").glob("*"))
+}
+report = {"steps": plan["steps"], "from": start, "chain": chain, "joined": joined}
+(output / "report.json").write_text(json.dumps(report))
 (output / "renders").mkdir()
 (output / "renders" / "one.png").write_bytes(b"\x89PNG counted")
 tell(plan["steps"], "exporting")

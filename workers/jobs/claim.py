@@ -35,6 +35,7 @@ class Claim:
     kind: JobKind
     parent: str | None
     fixed_from: str | None
+    part_photos: int | None
     options: dict[str, Any]
     smaller: dict[str, Any]
     checkpoint: dict[str, Any] | None
@@ -73,7 +74,7 @@ async def _claim(
         if row is not None and row["run_token"] == token:
             # An earlier try was committed and only its acknowledgement lost: the attempt counts once.
             return _claimed(row, token)
-        if row is None or row["state"] not in ("queued", "running"):
+        if row is None or row["state"] not in ("queued", "running") or row["awaits_parts"]:
             return None
         if not await job_queue.lock_taken(connection, row["queue_id"], worker_id):
             return None

@@ -11,7 +11,7 @@ from biresnerf.options.formats import ExportName, PosesOf
 from biresnerf.options.refine_options import OPTIONS, STAGE_1_OPTIONS, RefineOptions, parse_options
 from biresnerf.stages import REUSABLE_STAGES, ReusableStage
 from biresnerf.wire.base import Page
-from biresnerf.wire.jobs import JobView, WantedStage
+from biresnerf.wire.jobs import JobKind, JobView, WantedStage
 from workers.database.database import Connection
 from workers.database.ids import new_id
 from workers.jobs.job_rows import JOB, asked_columns, fingerprint_of, job_from_row, known_job, require_result
@@ -153,8 +153,13 @@ class DerivedJobs(JobStore):
         """All exports of a job, the oldest first."""
         async with self._database.transaction() as connection:
             await self._required(connection, job_id)
-            rows = await connection.rows(JOB + " WHERE parent = %s ORDER BY created_at, id", job_id)
-            return Page(items=tuple(map(job_from_row, rows)))
+            return await _below(connection, job_id, "export")
+
+    async def parts(self, job_id: str) -> Page[JobView]:
+        """The jobs that a job has split itself into, in order; none for most jobs."""
+        async with self._database.transaction() as connection:
+            await self._required(connection, job_id)
+            return await _below(connection, job_id, "refine")
 
     async def _insert_below(
         self, connection: Connection, parent: Mapping[str, Any], job_id: str, values: Mapping[str, Any]
@@ -164,6 +169,11 @@ class DerivedJobs(JobStore):
         row = {**own, "dataset_id": parent["dataset_id"], "tenant": parent["tenant"], **values}
         await queue_job(connection, await insert_job(connection, row))
         return job_from_row(await self._required(connection, job_id))
+
+
+async def _below(connection: Connection, job_id: str, kind: JobKind) -> Page[JobView]:
+    sql = JOB + " WHERE parent = %s AND kind = %s ORDER BY created_at, id"
+    return Page(items=tuple(map(job_from_row, await connection.rows(sql, job_id, kind))))
 
 
 def plan_fork(

@@ -53,13 +53,15 @@ async def expire_jobs(connection: Connection, limit: int) -> int:
     due = await connection.rows(
         "SELECT id, tenant, finished_at, artifacts FROM jobs WHERE expires_at <= now()"
         " AND state IN ('succeeded', 'failed', 'cancelled')"
-        # An unfinished export, fork or job that joins it still reads the files.
+        # An unfinished export, fork or job that joins it, or that it is a part of, still reads the files.
         " AND NOT EXISTS (SELECT 1 FROM jobs AS export WHERE export.parent = jobs.id"
         " AND export.state IN ('queued', 'running'))"
         " AND NOT EXISTS (SELECT 1 FROM jobs AS fork WHERE fork.forked_from = jobs.id"
         " AND fork.state IN ('queued', 'running'))"
         " AND NOT EXISTS (SELECT 1 FROM jobs AS joined WHERE joined.fixed_from = jobs.id"
         " AND joined.state IN ('queued', 'running'))"
+        " AND NOT EXISTS (SELECT 1 FROM jobs AS whole WHERE whole.id = jobs.parent"
+        " AND whole.state IN ('queued', 'running'))"
         " ORDER BY expires_at LIMIT %s FOR UPDATE SKIP LOCKED",
         limit,
     )

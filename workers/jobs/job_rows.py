@@ -15,15 +15,21 @@ from workers.database.database import Connection
 from workers.records import PREVIEW_FOLDER, THUMBNAIL_NAME, priority_name, record_from_row
 from workers.settings.errors import Conflict, Expired
 
-JOB = """
-    SELECT jobs.*, CASE WHEN jobs.state = 'queued' THEN
+# Into how many a job has split itself; none for any other.
+PARTS = """(SELECT jsonb_build_object('parts', count(*),
+        'over', count(*) FILTER (WHERE part.state NOT IN ('queued', 'running')),
+        'failed', count(*) FILTER (WHERE part.state NOT IN ('queued', 'running', 'succeeded')))
+    FROM jobs AS part WHERE part.parent = jobs.id AND part.kind = 'refine' HAVING count(*) > 0) AS parts"""
+JOB = f"""
+    SELECT jobs.*, {PARTS}, CASE WHEN jobs.state = 'queued' AND NOT jobs.awaits_parts THEN
         (SELECT count(*) FROM jobs AS ahead WHERE ahead.state = 'queued' AND ahead.kind = jobs.kind
+            AND NOT ahead.awaits_parts
             AND (ahead.queue_order, ahead.queue_id) <= (jobs.queue_order, jobs.queue_id))
         END AS queue_position
     FROM jobs"""
 # The same for many jobs at once: counting for each takes seconds if thousands wait.
 PLACES = """places AS (SELECT queue_id, row_number() OVER (PARTITION BY kind ORDER BY queue_order, queue_id)
-    AS queue_position FROM jobs WHERE state = 'queued')"""
+    AS queue_position FROM jobs WHERE state = 'queued' AND NOT awaits_parts)"""
 WHOLE_RESULT = ("poses.json", "report.json", "colmap/sparse/0/cameras.bin", "colmap/sparse/0/images.bin")
 # The parameter is the store's tenant; None for all tenants.
 MINE = "jobs.tenant = coalesce(%s, jobs.tenant)"

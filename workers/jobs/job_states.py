@@ -19,6 +19,7 @@ from biresnerf.wire.jobs import EventType
 from biresnerf.wire.problems import JobError
 from workers.database import job_queue
 from workers.database.database import Connection
+from workers.database.ids import new_id
 from workers.jobs.setbacks import SETBACKS, Cause
 from workers.records import LOG_NAME, POSES_NAME, PREVIEW_FOLDER, REPORT_NAME, Artifact
 from workers.settings.traces import traceparent
@@ -49,6 +50,59 @@ async def queue_job(connection: Connection, job: Mapping[str, Any]) -> None:
     """Put a new job into the queue at its tenant's turn."""
     await _enqueue(connection, job)
     await add_event(connection, job["id"], "queued")
+
+
+async def split_job(connection: Connection, job_id: str, parts: Sequence[Mapping[str, Any]]) -> None:
+    """Queue a job with each of these options below a running job, which is held in the queue until all are over."""
+    whole = await connection.only_row("SELECT * FROM jobs WHERE id = %s", job_id)
+    await requeue(connection, job_id, Requeue("split", {"parts": len(parts)}))
+    await connection.execute("UPDATE jobs SET awaits_parts = true, held = true WHERE id = %s", (job_id,))
+    await _enqueue(connection, {**whole, "held": True})
+    same = {name: whole[name] for name in ("tenant", "dataset_id", "priority", "key_id", "planned_steps")}
+    title = whole["labels"].get("name")
+    for number, options in enumerate(parts, start=1):
+        part = f"part {number} of {len(parts)}"
+        values = {
+            **same,
+            "id": new_id("job"),
+            "parent": job_id,
+            "options": Jsonb(dict(options)),
+            "labels": Jsonb({"name": f"{title}, {part}" if title else part}),
+            "fingerprint": f"{part} of {job_id}",
+        }
+        await queue_job(connection, await insert_job(connection, values))
+    await _tell_whole(connection, job_id)
+
+
+async def _tell_whole(connection: Connection, job_id: str) -> None:
+    """Show how many parts of a split job are over, and offer it if none is left."""
+    counted = await connection.only_row(
+        "SELECT count(*) AS parts, count(*) FILTER (WHERE state NOT IN ('queued', 'running')) AS over"
+        " FROM jobs WHERE parent = %s AND kind = 'refine'",
+        job_id,
+    )
+    waits = bool(counted["over"] < counted["parts"])
+    await connection.execute(
+        "UPDATE jobs SET awaits_parts = %s, message = %s WHERE id = %s",
+        (waits, f"{counted['over']} of {counted['parts']} parts are over" if waits else "", job_id),
+    )
+    if counted["over"]:
+        await add_event(connection, job_id, "part_over", counted)
+    if not waits:
+        await connection.execute("SELECT offer_held(tenant) FROM jobs WHERE id = %s", (job_id,))
+
+
+async def cancel_part_of_ended(connection: Connection, stall_s: float) -> bool:
+    """Cancel one part of a job that has ended without waiting for it; False if there is none."""
+    part = await connection.row(
+        "SELECT part.id FROM jobs AS part JOIN jobs AS whole ON whole.id = part.parent"
+        " WHERE part.kind = 'refine' AND part.state IN ('queued', 'running') AND NOT part.cancel_requested"
+        " AND whole.state NOT IN ('queued', 'running') LIMIT 1 FOR UPDATE OF part SKIP LOCKED"
+    )
+    if part is None:
+        return False
+    await request_cancel(connection, part["id"], None, False, stall_s)
+    return True
 
 
 async def _enqueue(connection: Connection, job: Mapping[str, Any]) -> None:
@@ -241,6 +295,14 @@ async def finish(
     if state == "cancelled":
         data["partial"] = partial
     await add_event(connection, job_id, state, data)
+    # The last of two parts that end at once sees the end of the other, as it waits for this lock.
+    whole = await connection.row(
+        "SELECT whole.id FROM jobs AS whole JOIN jobs AS part ON part.parent = whole.id"
+        " WHERE part.id = %s AND part.kind = 'refine' AND whole.awaits_parts FOR UPDATE OF whole",
+        job_id,
+    )
+    if whole is not None:
+        await _tell_whole(connection, whole["id"])
 
 
 def _error_column(error: JobError | None) -> Jsonb | None:

@@ -21,6 +21,7 @@ from workers.jobs.deliveries import add_deliveries, lock_for_delivery
 from workers.jobs.job_rows import (
     JOB,
     MINE,
+    PARTS,
     PLACES,
     asked_columns,
     events_of,
@@ -30,7 +31,7 @@ from workers.jobs.job_rows import (
     require_result,
     submission_fingerprint,
 )
-from workers.jobs.job_states import delete_job, insert_job, queue_job, request_cancel
+from workers.jobs.job_states import cancel_part_of_ended, delete_job, insert_job, queue_job, request_cancel
 from workers.jobs.job_updates import JobListener, follow
 from workers.jobs.quotas import require_room, submitting_for
 from workers.records import (
@@ -113,6 +114,7 @@ class JobStore(OwnedStore):
                 "dataset_id": asked.dataset_id,
                 "priority": priority,
                 "fixed_from": asked.fixed_from,
+                "part_photos": asked.part_photos,
                 "key_id": self._key_id,
                 "labels": Jsonb(asked.labels),
                 **await limit_columns(connection, asked),
@@ -154,9 +156,10 @@ class JobStore(OwnedStore):
         limit: int = 50,
         cursor: str | None = None,
     ) -> Page[JobView]:
-        """Refinements, newest first; raises `InputError` (``bad_cursor``)."""
+        """Refinements but those that are parts of others, newest first; raises `InputError` (``bad_cursor``)."""
         rows = await self._database.fetch(
-            f"WITH page AS MATERIALIZED (SELECT * FROM jobs WHERE kind = 'refine' AND {MINE}"
+            f"WITH page AS MATERIALIZED (SELECT *, {PARTS} FROM jobs"
+            f" WHERE kind = 'refine' AND parent IS NULL AND {MINE}"
             " AND (%s::timestamptz IS NULL OR created_at > %s)"
             " AND (%s::text IS NULL OR state = %s) AND (%s::jsonb IS NULL OR labels @> %s)"
             f"{NEWEST_FIRST}), {PLACES}"
@@ -191,7 +194,11 @@ class JobStore(OwnedStore):
         """
         async with self._database.transaction() as connection:
             await request_cancel(connection, job_id, self._tenant, keep_partial, self._settings.stall_s)
-            return job_from_row(await self._required(connection, job_id))
+            cancelled = job_from_row(await self._required(connection, job_id))
+        if cancelled.parts is not None:
+            while await self._database.run(cancel_part_of_ended, self._settings.stall_s):
+                pass
+        return cancelled
 
     async def delete(self, job_id: str) -> None:
         """Delete a final job with its files; raises `NotFound`, `Conflict` (``state_conflict``)."""
@@ -219,7 +226,8 @@ class JobStore(OwnedStore):
             own = await self._required(connection, job_id)
             require_files(own)
             exports = await connection.rows(
-                "SELECT artifacts FROM jobs WHERE parent = %s AND state = 'succeeded'", job_id
+                "SELECT artifacts FROM jobs WHERE parent = %s AND kind = 'export' AND state = 'succeeded'",
+                job_id,
             )
         listed = [*own["artifacts"], *(own["previews"] or {}).get("artifacts", [])]
         listed += [item for row in exports for item in row["artifacts"] if item["name"] != LOG_NAME]

@@ -21,7 +21,15 @@ from biresnerf.wire.jobs import EventType
 from biresnerf.wire.problems import JobError
 from workers.database.database import Connection, Database
 from workers.jobs.claim import Claim, Fenced
-from workers.jobs.job_states import Requeue, add_event, finish, finish_cancelled, requeue, trash_attempts
+from workers.jobs.job_states import (
+    Requeue,
+    add_event,
+    finish,
+    finish_cancelled,
+    requeue,
+    split_job,
+    trash_attempts,
+)
 from workers.process.waiting import retry_while_unavailable
 from workers.records import LOG_NAME, Artifact
 from workers.store.trash import discard
@@ -216,6 +224,15 @@ class Ledger:
     async def cancelled(self, connection: Connection, job: DictRow, artifacts: Sequence[Artifact]) -> None:
         """End the job as cancelled, with the files that are wanted."""
         await finish_cancelled(connection, job["id"], self._stall_s, artifacts, self.claim.name)
+
+    @_fenced(_not_cancelled)
+    async def split(self, connection: Connection, job: DictRow, parts: Sequence[Mapping[str, Any]]) -> bool:
+        """Queue a job with each of these options; this one waits for them. False if it was cancelled instead."""
+        if job["cancel_requested"]:
+            await finish_cancelled(connection, job["id"], self._stall_s)
+            return False
+        await split_job(connection, job["id"], parts)
+        return True
 
     @_fenced(_not_cancelled)
     async def give_back(self, connection: Connection, job: DictRow, how: Requeue) -> bool:

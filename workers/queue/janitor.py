@@ -17,7 +17,7 @@ from workers.database.database import Connection, Database
 from workers.database.statistics import fold_tallies, fold_use
 from workers.jobs.deadlines import end_overdue_jobs
 from workers.jobs.job_expiry import drop_left_checkpoints
-from workers.jobs.job_states import offer_held_jobs, requeue_lost, take_back
+from workers.jobs.job_states import cancel_part_of_ended, offer_held_jobs, requeue_lost, take_back
 from workers.settings.errors import Unavailable
 from workers.settings.settings import Settings
 from workers.store.files import FileStore
@@ -75,6 +75,8 @@ class Janitor:
                 await requeue_lost(connection, self._settings.stall_s)
                 await end_overdue_jobs(connection, self._settings.stall_s)
                 await offer_held_jobs(connection)
+                while await cancel_part_of_ended(connection, self._settings.stall_s):
+                    pass
                 await fold_tallies(connection)
                 await forget_full_buckets(connection)
         if time.monotonic() >= self._upkeep_at:

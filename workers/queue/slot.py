@@ -43,6 +43,7 @@ T = TypeVar("T")
 
 ENDS = {
     "succeeded": ExitStatus.DONE,
+    "split": ExitStatus.DONE,
     "failed": ExitStatus.JOB_FAILED,
     "cancelled": ExitStatus.JOB_CANCELLED,
     "stopped": ExitStatus.STOPPED,

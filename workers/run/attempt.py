@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from biresnerf.errors import Fault
-from biresnerf.options.refine_options import OPTIONS, ResolvedOptions, parse_options
+from biresnerf.options.refine_options import OPTIONS, RefineOptions, ResolvedOptions, parse_options
 from biresnerf.progress import Progress
 from biresnerf.report import Verdict, VerdictName
 from biresnerf.wire.problems import JobError
@@ -29,7 +29,7 @@ from workers.jobs.setbacks import Cause, crashed_too_often, used_up
 from workers.process.disk_space import EXIT_DISK, refused_to_write
 from workers.process.memory_limits import GROUPS, PROC, group_files
 from workers.process.waiting import first_done, retry_while_unavailable
-from workers.records import CRASH_NAME, LOG_NAME, Artifact
+from workers.records import CRASH_NAME, EXIT_SPLIT, LOG_NAME, SPLIT_NAME, Artifact
 from workers.run.child import Child, log_tail
 from workers.run.courier import Courier
 from workers.run.results import store_result
@@ -47,6 +47,7 @@ EXIT_MEMORY = 4
 KILLED, CHILD_KILLED = -signal.SIGKILL, "seeding_crashed"
 # Ours to fix, not the user's: a checkpoint of an older version, for example. The job starts over.
 STALE_CHECKPOINT = {"output_not_resumable", "checkpoint_invalid"}
+PARTS = TypeAdapter(tuple[RefineOptions, ...])
 DISCARDED_GRACE_S = 2.0  # for a cancelled job of which no partial result is wanted
 
 
@@ -57,7 +58,7 @@ class Ending:
     ``again_in_s``: seconds until the queue offers the job again; None if it has ended.
     """
 
-    how: Literal["succeeded", "failed", "cancelled", "stopped", "setback"]
+    how: Literal["succeeded", "failed", "cancelled", "stopped", "setback", "split"]
     again_in_s: float | None = None
 
 
@@ -152,7 +153,9 @@ class Attempt:
         """The exit status of the process; None if a stop came before its start."""
         # Restarted if database or store go away, which is no fault of the job.
         staging = asyncio.create_task(
-            retry_while_unavailable(lambda: stage_job(self._database, self._files, self._claim, self._folder))
+            retry_while_unavailable(
+                lambda: stage_job(self._database, self._files, self._settings, self._claim, self._folder)
+            )
         )
         await first_done(staging, self._stop.wait())
         if not staging.done():
@@ -214,6 +217,10 @@ class Attempt:
                 return Ending("succeeded")
             await self._ledger.cancelled(artifacts)
             return Ending("cancelled")
+        if status == EXIT_SPLIT:
+            parts = PARTS.validate_json((self._folder / SPLIT_NAME).read_bytes())
+            asked = [options.model_dump(mode="json", exclude_unset=True) for options in parts]
+            return Ending("split" if await self._ledger.split(asked) else "cancelled")
         self._log_crash()
         if status == EXIT_MEMORY or (status in (KILLED, *EXIT_ERRORS) and self._killed_for_memory(status)):
             return await self._ran_out_of_memory()

@@ -2,14 +2,15 @@
 
 Reads ``job.json``, writes one line of JSON per report to standard output, everything else to standard error.
 Exit status: 0 done; 2 the user's mistake, 3 the refinement failed (both described in ``error.json``); 4 out of
-memory; 5 the disk is full; 143 stopped by SIGTERM after writing a checkpoint, if there was anything to keep; 1 anything
-else, described for the operator in ``crash.txt``.
+memory; 5 the disk is full; 6 to be done in parts, by jobs with the options of ``split.json``; 143 stopped by SIGTERM
+after writing a checkpoint, if there was anything to keep; 1 anything else, described for the operator in ``crash.txt``.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import json
 import logging
 import os
 import shutil
@@ -18,7 +19,7 @@ import sys
 import threading
 import traceback
 from pathlib import Path
-from typing import Literal, TextIO
+from typing import TYPE_CHECKING, Literal, TextIO
 
 from pydantic import TypeAdapter
 
@@ -30,13 +31,23 @@ from biresnerf.options.refine_options import RefineOptions, parse_options
 from biresnerf.progress import Progress
 from biresnerf.stages import Stage
 from workers.process.disk_space import EXIT_DISK, failed_for_room
-from workers.records import CRASH_NAME
+from workers.records import CRASH_NAME, EXIT_SPLIT, SPLIT_NAME
+
+if TYPE_CHECKING:
+    from biresnerf.data.model.dataset import Dataset
 
 EXIT_BUG = 1
 EXIT_INPUT = 2
 EXIT_REFINEMENT = 3
 EXIT_MEMORY = 4
 EXIT_STOPPED = 128 + signal.SIGTERM
+
+
+class Split(FrozenModel):
+    """When to ask for parts: above so many photos, and about how many each is to have at most."""
+
+    above: int
+    most: int
 
 
 class Order(FrozenModel):
@@ -48,6 +59,8 @@ class Order(FrozenModel):
     options: dict[str, object]
     result: Path | None = None  # that is exported, or whose poses stay
     title: str | None = None  # of the report
+    parts: Path | None = None  # folders with the results of the job's parts
+    split: Split | None = None
 
 
 def main(folder: Path) -> int:
@@ -71,7 +84,7 @@ def _run(protocol: TextIO, stop: _Stop) -> int:
         if order.task == "export":
             _export(order, stop)
         else:
-            _refine(order, parse_options(order.options), protocol, stop)
+            return _refine(order, parse_options(order.options), protocol, stop)
     except Interrupted:
         return EXIT_STOPPED
     except (InputError, RefinementError) as error:
@@ -114,19 +127,22 @@ def is_out_of_memory(error: Exception) -> bool:
     return isinstance(error, RuntimeError) and reported
 
 
-def _refine(order: Order, options: RefineOptions, protocol: TextIO, stop: _Stop) -> None:
+def _refine(order: Order, options: RefineOptions, protocol: TextIO, stop: _Stop) -> int:
     from biresnerf.data.formats.read_dataset import read_dataset
-    from biresnerf.data.model.dataset import Dataset
     from biresnerf.data.photos.video.video_frames import VideoReading
-    from biresnerf.pipeline import refine_poses  # loads torch
     from biresnerf.run.photos_added import joined_to
     from biresnerf.write.output_folder import OutputFolder
 
     source: Path | Dataset = order.input
-    if order.result is not None:
+    large = order.split is not None and _may_be_split(order, order.split)
+    if order.result is not None or large:
         videos = VideoReading(options.video_frames)
-        dataset = read_dataset(order.input, strict=options.bad_frames == "refuse", videos=videos)
-        source, options = joined_to(dataset, options, order.result)
+        source = read_dataset(order.input, strict=options.bad_frames == "refuse", videos=videos)
+        if order.result is not None:
+            source, options = joined_to(source, options, order.result)
+        elif order.split is not None and _asks_for_parts(source, options, order.split):
+            return EXIT_SPLIT
+    from biresnerf.pipeline import refine_poses  # loads torch
 
     def tell(progress: Progress) -> None:
         stop.stage = progress.stage
@@ -140,9 +156,31 @@ def _refine(order: Order, options: RefineOptions, protocol: TextIO, stop: _Stop)
             options,
             on_progress=tell,
             should_stop=stop.asked.is_set,
+            parts=sorted(order.parts.iterdir()) if order.parts is not None else (),
         )
     finally:
         _give_video_frames(order)
+    return 0
+
+
+def _may_be_split(order: Order, split: Split) -> bool:
+    """Whether there are so many files, and no work of an earlier attempt, which would be lost."""
+    started = any(order.output.iterdir())
+    return not started and sum(1 for path in order.input.rglob("*") if path.is_file()) > split.above
+
+
+def _asks_for_parts(dataset: Dataset, options: RefineOptions, split: Split) -> bool:
+    """Write what jobs are to refine the parts, if there are enough photos to be used."""
+    from biresnerf.run.split_set import part_options, photos_of_parts
+
+    if len(options.photos or dataset) - len(options.leave_out) <= split.above:
+        return False
+    parts = photos_of_parts(dataset, options, split.most)
+    if len(parts) < 2:
+        return False
+    asked = [part_options(options, photos).model_dump(mode="json", exclude_unset=True) for photos in parts]
+    Path(SPLIT_NAME).write_text(json.dumps(asked))
+    return True
 
 
 def _give_video_frames(order: Order) -> None:

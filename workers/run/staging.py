@@ -9,17 +9,26 @@ from pathlib import Path
 from typing import Any
 
 from biresnerf.options.formats import formats
+from biresnerf.uncertainty import NOT_REFINED, PartReport
 from workers.database.database import Database
 from workers.jobs.claim import Claim, published_files
+from workers.settings.settings import Settings
 from workers.store.files import FileStore
 
 EXPORTED_FROM = ("poses.json", "colmap/sparse/0/")  # of a result; all other formats can be made from these
+JOINED_FROM = ("poses.json", "report.json", "colmap/sparse/0/")  # of the result of a part
+PARTS = (
+    "SELECT state, artifacts, error, options FROM jobs WHERE parent = %s AND kind = 'refine'"
+    " ORDER BY created_at, id"
+)
 JOINED_TO = ("poses.json", "report.json", "transforms.json")  # of a result whose poses stay
 VIDEO_FRAMES = "video_frames/"  # of a result: photos that its dataset holds as a video
 PANORAMA_VIEWS = "panorama_views/"  # of a result: what was cut from its dataset's panoramas
 
 
-async def stage_job(database: Database, files: FileStore, claim: Claim, folder: Path) -> None:
+async def stage_job(
+    database: Database, files: FileStore, settings: Settings, claim: Claim, folder: Path
+) -> None:
     """Fill the fresh job folder. Paths in the order are relative, so that another machine can continue the job.
 
     Raises `NotFound` if a file is gone, `Unavailable`.
@@ -36,6 +45,13 @@ async def stage_job(database: Database, files: FileStore, claim: Claim, folder: 
         order["result"] = "result"
         found = await published_files(database, claim.fixed_from)
         await _stage_result(files, found, JOINED_TO, folder / "result")
+    if claim.kind == "refine" and claim.parent is None:
+        if parts := await database.fetch(PARTS, claim.job_id):
+            order["parts"] = "parts"
+            await _stage_parts(files, parts, folder / "parts")
+        elif claim.part_photos or settings.split_above:
+            most = claim.part_photos or settings.part_photos
+            order["split"] = {"above": claim.part_photos or settings.split_above, "most": most}
     if claim.kind == "refine" or _needs_photos(claim.options["formats"]):
         rows = await database.fetch(
             "SELECT key, path FROM dataset_files WHERE dataset_id = %s", claim.dataset_id
@@ -47,6 +63,21 @@ async def stage_job(database: Database, files: FileStore, claim: Claim, folder: 
             await files.stage((pair for pair in found if pair[1].startswith(kind)), folder / place)
     await files.stage(_resumed_files(claim), folder / "output")
     (folder / "job.json").write_text(json.dumps(order, indent=1))
+
+
+async def _stage_parts(files: FileStore, parts: list[dict[str, Any]], folder: Path) -> None:
+    """The result of each part in a folder of its own, or why there is none."""
+    width = max(2, len(str(len(parts))))
+    for number, part in enumerate(parts, start=1):
+        place = folder / f"part-{number:0{width}}"
+        place.mkdir(parents=True)
+        if part["state"] == "succeeded":
+            found = [(item["key"], item["name"]) for item in part["artifacts"]]
+            await files.stage((pair for pair in found if pair[1].startswith(JOINED_FROM)), place)
+            continue
+        why = (part["error"] or {}).get("detail") or f"its job ended as {part['state']}"
+        report = PartReport(name=place.name, photos=len(part["options"]["photos"]), why_not=why)
+        (place / NOT_REFINED).write_text(report.model_dump_json())
 
 
 def _needs_photos(names: list[str]) -> bool:

@@ -103,6 +103,12 @@ class Settings(BaseSettings):
         6.0, gt=0, description="Seconds a cancelled job has to write a partial result."
     )
     job_timeout_s: float = Field(2 * 3600, gt=0, description="Longest run of one attempt.")
+    split_above: int = Field(
+        1000,
+        ge=0,
+        description="Photos above which a job splits itself into parts; 0: never, unless it asks to.",
+    )
+    part_photos: int = Field(400, ge=20, description="Photos of such a part, about.")
     check_timeout_s: float = Field(
         900, gt=0, description="Longest validation of one dataset; of small ones less."
     )

@@ -92,6 +92,12 @@ class _SetParameter(click.ParamType):
     help="Stop the job then, with its best poses so far; as expired if it has not started. Local time, unless it says "
     "otherwise.",
 )
+@click.option(
+    "--part-photos",
+    type=click.IntRange(20, 10_000),
+    metavar="PHOTOS",
+    help="Split the job into parts of about so many photos, for several workers. Default: as the service has set.",
+)
 @label_option
 @click.option(
     "--fixed-from",

@@ -33,13 +33,12 @@ def split_command(
     """
     asked = parse_options(settings)
     from biresnerf.data.formats.read_dataset import read_dataset
-    from biresnerf.data.model.part_of_set import without_photos
-    from biresnerf.data.parts.cut_set import PHOTOS, cut_set
+    from biresnerf.data.parts.cut_set import PHOTOS
     from biresnerf.data.photos.video.video_frames import VideoReading
+    from biresnerf.run.split_set import photos_of_parts
 
     dataset = read_dataset(input_path, videos=VideoReading(asked.video_frames))
-    dataset = without_photos(dataset, asked.leave_out, asked.photos)
-    parts = cut_set(dataset, PHOTOS if most is None else most)
+    parts = photos_of_parts(dataset, asked, PHOTOS if most is None else most)
     require_empty(output)
     output.mkdir(parents=True, exist_ok=True)
     files, commands = [], []
@@ -50,9 +49,9 @@ def split_command(
         ]
     )
     width = max(2, len(str(len(parts))))
-    for number, rows in enumerate(parts, start=1):
+    for number, photos in enumerate(parts, start=1):
         names = output / f"part-{number:0{width}}.txt"
-        names.write_text("".join(f"{dataset.names[row]}\n" for row in rows.tolist()), "utf-8")
+        names.write_text("".join(f"{name}\n" for name in photos), "utf-8")
         files.append(names)
         result = output / "results" / names.stem
         commands.append(
@@ -60,11 +59,13 @@ def split_command(
         )
     join = f"biresnerf refine {source} --join {quote(str(output / 'results'))} --output OUT"
     found = {
-        "photos": len(dataset),
-        "parts": [{"file": str(name), "photos": len(rows)} for name, rows in zip(files, parts, strict=True)],
+        "photos": len(set().union(*parts)),
+        "parts": [
+            {"file": str(name), "photos": len(photos)} for name, photos in zip(files, parts, strict=True)
+        ],
         "refine": commands,
         "join": join,
     }
-    sizes = ", ".join(str(len(rows)) for rows in parts)
-    lines = [f"# {len(dataset)} photos in {len(parts)} parts of {sizes}", *commands, join]
+    sizes = ", ".join(str(len(photos)) for photos in parts)
+    lines = [f"# {found['photos']} photos in {len(parts)} parts of {sizes}", *commands, join]
     show(found, "\n".join(lines), as_json=as_json)

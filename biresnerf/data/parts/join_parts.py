@@ -19,12 +19,12 @@ from biresnerf.data.points.tracks import KEPT, Tracks
 from biresnerf.data.seeding.colmap_tracks import most_observations
 from biresnerf.data.seeding.map_images import PARTS, SAME_DEG, MappedModel, numbered_names
 from biresnerf.data.seeding.match_poses import JUDGED_FROM, carry_model
-from biresnerf.errors import InputError
+from biresnerf.errors import InputError, RefinementError
 from biresnerf.geometry.camera.camera_models import Camera
 from biresnerf.geometry.pose_error import rotation_between_deg
 from biresnerf.geometry.rigid import rigid_inverse
 from biresnerf.geometry.similarity import align_robust
-from biresnerf.uncertainty import PartReport, PartsReport, SeamReport
+from biresnerf.uncertainty import NOT_REFINED, PartReport, PartsReport, SeamReport
 
 FEW = f"it shares fewer than {JUDGED_FROM} photos with the others"
 APART = "photos that it shares with the others have other poses there"
@@ -105,9 +105,23 @@ class AskParts:
 
         Raises:
             InputError: a code of `read_part`.
+            RefinementError: ``parts_failed``: none of the parts has a result.
         """
-        parts = [read_part(dataset, folder) for folder in self.folders]
+        missing = [
+            PartReport.model_validate_json(why.read_bytes())
+            for folder in self.folders
+            if (why := folder / NOT_REFINED).is_file()
+        ]
+        refined = [folder for folder in self.folders if not (folder / NOT_REFINED).is_file()]
+        if not refined:
+            raise RefinementError(
+                "parts_failed", f"None of the {len(missing)} parts was refined: {missing[0].why_not}"
+            )
+        parts = [read_part(dataset, folder) for folder in refined]
         model, report = join(len(dataset), parts)
+        if missing:
+            every = sorted((*report.parts, *missing), key=lambda part: part.name)
+            report = report.model_copy(update={"parts": tuple(every)})
         tracks = joined_tracks([part.tracks for part in parts], len(dataset))
         if tracks is not None and log_folder is not None:
             log_folder.mkdir(parents=True, exist_ok=True)

@@ -8,6 +8,7 @@ import { shared } from "../api/http";
 import { pictureUrl } from "../api/picture_urls";
 import { useStore } from "../api/store";
 import { Downloads } from "../downloads/downloads";
+import { Parts } from "../jobs/parts";
 import { Chip, isOver, ProgressBar, type Stage, STAGE_WORDS, STATE_WORDS, titleOf } from "../jobs/state";
 import { moment } from "../parts/format";
 import { NotifySwitch } from "../parts/notify";
@@ -37,6 +38,7 @@ export function JobPage({ id }: { id: string }) {
       {problem && <ProblemBox problem={problem} />}
       <Failure job={job} images={seen.poses?.images.map(({ name }) => name) ?? []} />
       <Announced job={job} />
+      {!guest && job.parts && <Parts job={job} />}
       <Views seen={seen} />
       <Files live={live} seen={seen} />
       {job.delivered.length > 0 && <Deliveries job={job} />}
@@ -136,6 +138,7 @@ function Facts({ job, seen }: { job: JobView; seen: LiveState }) {
         <Fact name="Job" value={job.id} />
         {!shared.value && <Fact name="Image set" value={job.dataset_id} link={`#/datasets/${job.dataset_id}`} />}
         {!shared.value && job.forked_from && <Fact name="Forked from" value={job.forked_from} link={`#/jobs/${job.forked_from}`} />}
+        {!shared.value && job.parent && <Fact name="Part of" value={job.parent} link={`#/jobs/${job.parent}`} />}
         {!shared.value && job.fixed_from && <Fact name="Joins" value={job.fixed_from} link={`#/jobs/${job.fixed_from}`} />}
         <Fact name="Submitted" value={moment(job.created_at)} />
         {job.expires_at && <Fact name="Kept until" value={moment(job.expires_at)} />}

@@ -31,7 +31,7 @@ export function WaitingPhotos({ job, photos: { list, cellOf } }: { job: JobView;
     <>
       <p class="soft">
         {count(list.photos.length, "photo")}.
-        {job.state === "queued" && " The job starts when a worker is free."}
+        {job.queue_position !== null && " The job starts when a worker is free."}
         {seconds && ` It takes about ${roughlyBetween(...seconds)} after it starts.`}
       </p>
       <ul class="waiting-photos" aria-label="Photos of the set">

@@ -60,8 +60,8 @@ function whereWords({ stage, progress: { step, steps_total } }: JobView): string
 }
 
 /** What it does now, the step and the time left, in one line. */
-function progressWords(job: JobView): string {
-  if (job.state === "queued") return job.queue_position ? `Number ${job.queue_position} in the queue` : "Waiting";
+export function progressWords(job: JobView): string {
+  if (job.state === "queued") return job.queue_position ? `Number ${job.queue_position} in the queue` : job.message || "Waiting";
   if (job.state !== "running") {
     const took = job.started_at && job.finished_at && Date.parse(job.finished_at) - Date.parse(job.started_at);
     const words = `${STATE_WORDS[job.state]}${job.state === "cancelled" ? whereWords(job) : ""}`;

@@ -173,7 +173,9 @@ CREATE INDEX batches_with_key ON batches (finished_at) WHERE idempotency_key IS 
 -- `resolved_options`: as the latest attempt used them; `planned_steps`: the cost of the job, which decides its turn.
 -- `crashes`: attempts that crashed since the last checkpoint; `losses`: that lost their worker, which is seldom the
 -- job's fault and counts apart; `setback`: why the last attempt ended before its job did. `slot_kind`: of the slot that
--- runs the job, or ran it last. `fixed_from`: the job whose result this one joins its photos to. (No reference: what
+-- runs the job, or ran it last. `part_photos`: a job on more photos splits itself into jobs below it, each on about so
+-- many; none: as the operator says. `awaits_parts`: it is held until these are over, and then joins their results.
+-- `fixed_from`: the job whose result this one joins its photos to. (No reference: what
 -- was joined stays when the other is deleted.) `share_round`: signed into links to its files; the next one ends them.
 -- `key_id`: the API key that submitted it. `attempt_…`: of the latest attempt, when it began, when it was last known to
 -- run, and its processor seconds until then; `processor_s`, `wall_s`, `gpu_s`: what all attempts that are over used.
@@ -188,6 +190,8 @@ CREATE TABLE jobs (
     forked_from text,
     forked_stage text,
     fixed_from text,
+    part_photos int,
+    awaits_parts boolean NOT NULL DEFAULT false,
     batch_id text REFERENCES batches,
     state text NOT NULL DEFAULT 'queued'
         CHECK (state IN ('queued', 'running', 'succeeded', 'failed', 'cancelled', 'expired')),

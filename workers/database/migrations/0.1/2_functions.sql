@@ -83,7 +83,7 @@ DECLARE
     _offered int := 0;
     _job record;
 BEGIN
-    IF NOT EXISTS (SELECT 1 FROM jobs WHERE tenant = _tenant AND held AND state = 'queued') THEN
+    IF NOT EXISTS (SELECT 1 FROM jobs WHERE tenant = _tenant AND held AND NOT awaits_parts AND state = 'queued') THEN
         RETURN 0;
     END IF;
     -- Of two that offer at once (a janitor, an end, a new limit) neither sees what the other offers.
@@ -93,7 +93,7 @@ BEGIN
         FROM jobs WHERE tenant = _tenant AND kind = 'refine' AND NOT held AND state IN ('queued', 'running');
     FOR _job IN
         -- One that is being cancelled is passed over.
-        SELECT id, queue_id FROM jobs WHERE tenant = _tenant AND held AND state = 'queued'
+        SELECT id, queue_id FROM jobs WHERE tenant = _tenant AND held AND NOT awaits_parts AND state = 'queued'
             ORDER BY queue_order, queue_id LIMIT _room FOR NO KEY UPDATE SKIP LOCKED
     LOOP
         UPDATE jobs SET held = false WHERE id = _job.id;
@@ -215,7 +215,7 @@ BEGIN
         'started_at', rfc3339(started_at), 'finished_at', rfc3339(finished_at),
         'links', jsonb_build_object('self', '/v1/jobs/' || id, 'report', '/v1/jobs/' || id || '/report',
             'artifacts', '/v1/jobs/' || id || '/artifacts')))
-    FROM jobs WHERE id = NEW.job_id;
+    FROM jobs WHERE id = NEW.job_id AND (kind <> 'refine' OR parent IS NULL);  -- what a split job tells is enough
     RETURN NULL;
 END;
 $$;
