@@ -23,6 +23,7 @@ Kind = Literal["good", "refused", "poisoned", "cancelled"]
 FINAL = {"succeeded", "failed", "cancelled"}
 ANSWER_S = 8.0
 LONG_POLL_S = 4.0
+PARTS = 3  # of the jobs that split themselves
 RESULT = {"log.txt", "renders/one.png", "report.json"}
 TUS = {"Tus-Resumable": "1.0.0"}
 
@@ -83,6 +84,7 @@ class Clients:
             "journal": str(self.folder / f"journal-{n}"),
             **({"refuse": True} if kind == "refused" else {}),
             **({"die_at": 3} if kind == "poisoned" else {}),
+            **({"parts": PARTS} if n % 3 == 0 else {}),
         }
         return Seen(kind, plan)
 
@@ -180,6 +182,10 @@ class Clients:
                 said = answer.json()
                 if said["chain"] != chain(seen.plan["seed"], seen.plan["steps"]):
                     seen.faults.append(f"the result is wrong: {said}")
+                if {name: files for name, files in said["joined"].items() if files != ["report.json"]}:
+                    seen.faults.append(f"parts were lost: {said['joined']}")
+                if len(said["joined"]) != seen.plan.get("parts", 0):
+                    seen.faults.append(f"other parts were joined: {said['joined']}")
             if item["name"] == "renders/one.png" and answer.content != b"\x89PNG counted":
                 seen.faults.append("the render is wrong")
         names = sorted(item["name"] for item in listed)

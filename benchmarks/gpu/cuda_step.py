@@ -1,7 +1,8 @@
 """One optimisation step of the field on a GPU: the Triton kernels against the plain-torch definition.
 
-``python -m benchmarks.gpu.cuda_step`` prints a JSON line for each stage; with ``--profile``, where a step's time goes;
-with ``--waiting``, the host waits for each kernel, which shows the one that fails.
+``python -m benchmarks.gpu.cuda_step`` prints a JSON line for each stage; with ``--profile``, where a step's time goes.
+To find what fails: ``--alone kernels`` and ``--alone plain`` take steps of one field only, and with ``--waiting`` the
+host waits for each kernel.
 """
 
 from __future__ import annotations
@@ -29,6 +30,8 @@ from biresnerf.field.reference.field import ReferenceField
 
 LEVELS, SIDE = 16, 128
 DEVICE = torch.device("cuda")
+SHAPE = FieldShape(grid_levels(3, 16, 72, 22), grid_levels(LEVELS, 128, 4096, 19), unbounded=False)
+ALONE = {"kernels": CudaField, "plain": ReferenceField}
 
 
 def _rays(count: int) -> Rays:
@@ -66,8 +69,7 @@ def _steps(field: RadianceField, rays: int, steps: int, occupied: torch.Tensor) 
 
 def run(rays: int, rounds: int) -> Iterator[dict[str, float | str | int]]:
     """A row for each stage at the paper's encodings (Table 1), T = 2^19: medians, measured alternately."""
-    shape = FieldShape(grid_levels(3, 16, 72, 22), grid_levels(LEVELS, 128, 4096, 19), unbounded=False)
-    kernels, plain = CudaField(shape, 0, DEVICE), ReferenceField(shape, 0, DEVICE)
+    kernels, plain = (field(SHAPE, 0, DEVICE) for field in ALONE.values())
     occupied = _shell()
     for stage in ("coarse", "fine"):
         if stage == "fine":
@@ -86,6 +88,17 @@ def run(rays: int, rounds: int) -> Iterator[dict[str, float | str | int]]:
             "ratio": statistics.median(slow / fast for (fast, _), (slow, _) in pairs),
             "kernels_ns_per_sample": 1e9 * statistics.median(fast / n for (fast, n), _ in pairs),
         }
+
+
+def run_alone(name: str, rays: int, steps: int) -> Iterator[dict[str, str | int]]:
+    """A row for each stage, so that a fault is that of this field."""
+    field = ALONE[name](SHAPE, 0, DEVICE)
+    for stage in ("coarse", "fine"):
+        if stage == "fine":
+            field.start_reconstruction()
+        for done in range(0, steps, 20):
+            _, samples = _steps(field, rays, 20, _shell())
+            yield {"field": name, "stage": stage, "steps": done + 20, "samples": samples}
 
 
 def wait_for_each_launch() -> None:
@@ -113,8 +126,7 @@ def profile(rays: int) -> str:
     from torch.profiler import ProfilerActivity
     from torch.profiler import profile as watch
 
-    shape = FieldShape(grid_levels(3, 16, 72, 22), grid_levels(LEVELS, 128, 4096, 19), unbounded=False)
-    field, occupied = CudaField(shape, 0, DEVICE), _shell()
+    field, occupied = CudaField(SHAPE, 0, DEVICE), _shell()
     field.start_reconstruction()
     _steps(field, rays, 3, occupied)
     with watch(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA]) as seen:
@@ -126,10 +138,15 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--profile", action="store_true")
     parser.add_argument("--waiting", action="store_true")
+    parser.add_argument("--alone", choices=tuple(ALONE))
     asked = parser.parse_args()
     if asked.waiting:
         wait_for_each_launch()
-    if asked.profile:
+    torch.manual_seed(0)
+    if asked.alone:
+        for row in run_alone(asked.alone, 8192, 200):
+            print(json.dumps(row), flush=True)
+    elif asked.profile:
         print(profile(8192))
     else:
         for row in run(8192, 5):

@@ -7,8 +7,8 @@ import weakref
 from collections.abc import Awaitable, Callable, Iterator
 from concurrent import futures
 from concurrent.futures import Future
-from contextlib import ExitStack
-from queue import SimpleQueue
+from contextlib import ExitStack, suppress
+from queue import Empty, SimpleQueue
 from types import TracebackType
 from typing import Any, Concatenate, ParamSpec, TypeAlias, TypeVar, Unpack
 
@@ -22,6 +22,7 @@ from biresnerf.client.transport import ClientOptions
 P = ParamSpec("P")
 T = TypeVar("T")
 # From the event loop's thread to the calling thread; None is the last one.
+WAIT_S = 1.0
 _Messages: TypeAlias = SimpleQueue[Any]
 
 
@@ -133,7 +134,7 @@ class Client:
 
         future = self._start(forward, messages)
         try:
-            while (event := messages.get()) is not None:
+            while (event := _next(messages)) is not None:
                 yield event
             future.result()
         finally:
@@ -165,7 +166,7 @@ class Client:
         future: Future[list[T]] | None = None
         try:
             future = self._start(cancellable, messages)
-            while (message := messages.get()) is not None:
+            while (message := _next(messages)) is not None:
                 callback, returned = message
                 callback()
                 self._portal.start_task_soon(returned.set)
@@ -194,3 +195,10 @@ async def _relay(messages: _Messages, callback: Callable[..., object], *facts: o
     returned = anyio.Event()
     messages.put((functools.partial(callback, *facts), returned))
     await returned.wait()
+
+
+def _next(messages: _Messages) -> Any:
+    """The next message. Python loses a signal that comes just before a wait begins until it ends: none is long."""
+    while True:
+        with suppress(Empty):
+            return messages.get(timeout=WAIT_S)

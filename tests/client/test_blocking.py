@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import _thread
 import inspect
 import itertools
 import os
@@ -102,6 +103,20 @@ def test_ctrl_c_ends_a_call_at_once_and_the_client_goes_on() -> None:
         thread.join()
         assert ended.wait(60)  # not left behind on the event loop
         client.delete_job("job_1")
+
+
+def test_ctrl_c_just_before_a_wait_begins_is_noticed() -> None:
+    """Its handler has set a flag that Python reads between two instructions, but no signal ends the wait."""
+
+    def interrupt() -> None:
+        stuck.wait(60)
+        _thread.interrupt_main()
+
+    with blocking(busy) as client:
+        threading.Thread(target=interrupt).start()
+        with pytest.raises(KeyboardInterrupt):
+            client.job("job_1")
+        assert ended.wait(60)
 
 
 def test_ctrl_c_while_a_call_starts_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,7 @@
 """A job program for the tests: the protocol of `workers.run.job_process`, real result files, no torch.
 
-`steps` says how many steps, `seed` how many milliseconds each takes; `threads=77` fails as a diverged job does.
+`steps` says how many steps, `seed` how many milliseconds each takes; `threads=77` fails as a diverged job does. A job
+that asks for parts is split into three.
 Matches contradict all photos where `seed` is above 30.
 """
 
@@ -20,6 +21,7 @@ from biresnerf.progress import Progress
 from biresnerf.report import Report
 from service.docs.examples import example_of
 from service.web_page import EXAMPLE
+from workers.records import EXIT_SPLIT, SPLIT_NAME
 
 folder = Path(sys.argv[1])
 order = json.loads((folder / "job.json").read_text())
@@ -47,6 +49,9 @@ if order.get("task") == "export":
     for form in order["options"]["formats"]:
         (output / f"{form}.txt").write_text("exported")
     sys.exit(0)
+if order.get("split", {}).get("above", 1000) < 1000:
+    (folder / SPLIT_NAME).write_text(json.dumps([{**order["options"], "photos": [name]} for name in "abc"]))
+    sys.exit(EXIT_SPLIT)
 resolved = parse_options(order["options"]).resolved("cpu")
 options = resolved.model_dump(mode="json")
 steps, step_s = options["steps"], options["seed"] / 1000

@@ -265,6 +265,22 @@ class Counting:
     async def until_final(self, timeout_s: float = PATIENCE_S) -> JobView:
         return await self.until(lambda job: job.final, timeout_s)
 
+    async def nobodys_files(self) -> list[str]:
+        """Stored files of the job that nothing refers to and no janitor will delete."""
+        database = self.stores.jobs._database
+        rows = await database.fetch(
+            "SELECT prefix, keep FROM trash WHERE prefix LIKE %s", f"jobs/{self.id}/%"
+        )
+        known = {row["key"] for row in await database.fetch("SELECT key FROM job_file_keys")}
+        going = [(f"{row['prefix']}/", f"{row['prefix']}/{row['keep']}/") for row in rows]
+        keys = [file.key for file in await self.stores.files.list(f"jobs/{self.id}")]
+        return [
+            key
+            for key in keys
+            if key not in known
+            and not any(key.startswith(prefix) and not key.startswith(keep) for prefix, keep in going)
+        ]
+
     def starts(self) -> list[dict[str, object]]:
         return (
             [json.loads(line) for line in self._journal.read_text().splitlines()]

@@ -125,6 +125,8 @@ joined = {
 }
 report = {"steps": plan["steps"], "from": start, "chain": chain, "joined": joined}
 (output / "report.json").write_text(json.dumps(report))
+if plan.get("poses"):
+    (output / "poses.json").write_text("{}")
 (output / "renders").mkdir()
 (output / "renders" / "one.png").write_bytes(b"\x89PNG counted")
 tell(plan["steps"], "exporting")

@@ -120,3 +120,12 @@ async def published_files(database: Database, job_id: str) -> list[tuple[str, st
     if not rows:
         raise NotFound(f"No job {job_id}.")
     return [(item["key"], item["name"]) for item in rows[0]["artifacts"]]
+
+
+async def parts_of(database: Database, job_id: str) -> list[dict[str, Any]]:
+    """State, artifacts, error and options of each part of a job that has split itself, in order; else none."""
+    return await database.fetch(
+        "SELECT state, artifacts, error, options FROM jobs WHERE parent = %s AND kind = 'refine'"
+        " ORDER BY created_at, id",
+        job_id,
+    )

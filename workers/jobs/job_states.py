@@ -328,19 +328,19 @@ async def finish_cancelled(
     row = await connection.only_row("SELECT keep_partial, previews, error FROM jobs WHERE id = %s", job_id)
     logs = [item for item in artifacts if item.name == LOG_NAME]
     kept, shown = list(artifacts), None
-    if row["keep_partial"] and not _is_whole(kept) and row["previews"] is not None:
+    if row["keep_partial"] and not is_whole(kept) and row["previews"] is not None:
         shown = row["previews"]["prefix"].rpartition("/")[2]
         kept = logs + [
             item.model_copy(update={"name": item.name.removeprefix(f"{PREVIEW_FOLDER}/")})
             for item in map(Artifact.model_validate, row["previews"]["artifacts"])
         ]
-    partial = row["keep_partial"] and _is_whole(kept)
+    partial = row["keep_partial"] and is_whole(kept)
     why = JobError.model_validate(row["error"]) if row["error"] else None
     await finish(connection, job_id, "cancelled", why, kept if partial else logs, partial=partial)
     await trash_attempts(connection, job_id, stall_s, keep, preview=shown)
 
 
-def _is_whole(artifacts: Sequence[Artifact]) -> bool:
+def is_whole(artifacts: Sequence[Artifact]) -> bool:
     """Whether there are poses and a report. The report is written last, so a killed process may lack it."""
     return {POSES_NAME, REPORT_NAME} <= {item.name for item in artifacts}
 

@@ -212,18 +212,19 @@ class Ledger:
     async def fail(
         self, connection: Connection, job: DictRow, error: JobError, artifacts: Sequence[Artifact]
     ) -> bool:
-        """End the job as failed; returns False if it was cancelled instead."""
+        """End the job as failed; returns False if a cancellation was requested first."""
         if job["cancel_requested"]:
-            await finish_cancelled(connection, job["id"], self._stall_s, artifacts, self.claim.name)
             return False
         await finish(connection, job["id"], "failed", error, artifacts)
         await trash_attempts(connection, job["id"], self._stall_s, self.claim.name)
         return True
 
     @_fenced(_nothing)
-    async def cancelled(self, connection: Connection, job: DictRow, artifacts: Sequence[Artifact]) -> None:
-        """End the job as cancelled, with the files that are wanted."""
-        await finish_cancelled(connection, job["id"], self._stall_s, artifacts, self.claim.name)
+    async def cancelled(
+        self, connection: Connection, job: DictRow, artifacts: Sequence[Artifact], keep: str
+    ) -> None:
+        """End the job as cancelled, with these files, which are all that is in the folder ``keep`` of its results."""
+        await finish_cancelled(connection, job["id"], self._stall_s, artifacts, keep)
 
     @_fenced(_not_cancelled)
     async def split(self, connection: Connection, job: DictRow, parts: Sequence[Mapping[str, Any]]) -> bool:

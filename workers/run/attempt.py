@@ -23,7 +23,7 @@ from biresnerf.report import Verdict, VerdictName
 from biresnerf.wire.problems import JobError
 from workers.database.database import Database
 from workers.jobs.claim import Claim, Fenced
-from workers.jobs.job_states import Requeue
+from workers.jobs.job_states import Requeue, is_whole
 from workers.jobs.ledger import Ledger
 from workers.jobs.setbacks import Cause, crashed_too_often, used_up
 from workers.process.disk_space import EXIT_DISK, refused_to_write
@@ -48,6 +48,7 @@ KILLED, CHILD_KILLED = -signal.SIGKILL, "seeding_crashed"
 # Ours to fix, not the user's: a checkpoint of an older version, for example. The job starts over.
 STALE_CHECKPOINT = {"output_not_resumable", "checkpoint_invalid"}
 PARTS = TypeAdapter(tuple[RefineOptions, ...])
+LOG_ALONE = "-log"  # ends the name of the folder of a cancelled attempt of which only the log is kept
 DISCARDED_GRACE_S = 2.0  # for a cancelled job of which no partial result is wanted
 
 
@@ -102,7 +103,8 @@ class Attempt:
             return await self._run()
         except Fenced:
             # Nothing refers to what was stored meanwhile, and the trash of this job may have been emptied already.
-            await self._files.delete_prefix(self._result_prefix)
+            for prefix in (self._result_prefix, f"{self._result_prefix}{LOG_ALONE}"):
+                await self._files.delete_prefix(prefix)
             raise
         finally:
             noting.cancel()
@@ -138,7 +140,21 @@ class Attempt:
         return Ending("stopped" if how.setback is None else "setback", again_in_s)
 
     async def _fail(self, error: JobError, artifacts: list[Artifact]) -> Ending:
-        return Ending("failed" if await self._ledger.fail(error, artifacts) else "cancelled")
+        if await self._ledger.fail(error, artifacts):
+            return Ending("failed")
+        return await self._end_cancelled()
+
+    async def _end_cancelled(self) -> Ending:
+        """End as cancelled, with the partial result if one is wanted and there, else with the log."""
+        keep = self._claim.name
+        artifacts = await self._store() if await self._ledger.wants_partial() else []
+        if not is_whole(artifacts):
+            # In a folder of its own: what is in the other goes, whatever came there before the cancellation.
+            keep += LOG_ALONE
+            prefix = f"{self._result_prefix}{LOG_ALONE}"
+            artifacts = await store_result(self._files, prefix, self._output, self._log, log_only=True)
+        await self._ledger.cancelled(artifacts, keep)
+        return Ending("cancelled")
 
     async def _wait(self, cause: Cause) -> Ending:
         """Give the job back until there is room, or the store answers."""
@@ -215,8 +231,7 @@ class Attempt:
             artifacts = await self._store(enough=lambda: self._stop_reason == "cancel")
             if await self._ledger.publish(artifacts, *self._reported_result()):
                 return Ending("succeeded")
-            await self._ledger.cancelled(artifacts)
-            return Ending("cancelled")
+            return await self._end_cancelled()
         if status == EXIT_SPLIT:
             parts = PARTS.validate_json((self._folder / SPLIT_NAME).read_bytes())
             asked = [options.model_dump(mode="json", exclude_unset=True) for options in parts]
@@ -230,9 +245,7 @@ class Attempt:
                 return await self._crashed("error", error.detail, forget_checkpoint=True)
             return await self._fail(error, await self._store(log_only=True))
         if self._stop_reason == "cancel":
-            unwanted = not await self._ledger.wants_partial()
-            await self._ledger.cancelled(await self._store(log_only=unwanted))
-            return Ending("cancelled")
+            return await self._end_cancelled()
         if self._stop_reason == "shutdown":
             return await self._give_back(Requeue("requeued", {"why": "shutdown"}))
         if status == EXIT_DISK:

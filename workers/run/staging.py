@@ -11,16 +11,12 @@ from typing import Any
 from biresnerf.options.formats import formats
 from biresnerf.uncertainty import NOT_REFINED, PartReport
 from workers.database.database import Database
-from workers.jobs.claim import Claim, published_files
+from workers.jobs.claim import Claim, parts_of, published_files
 from workers.settings.settings import Settings
 from workers.store.files import FileStore
 
 EXPORTED_FROM = ("poses.json", "colmap/sparse/0/")  # of a result; all other formats can be made from these
 JOINED_FROM = ("poses.json", "report.json", "colmap/sparse/0/")  # of the result of a part
-PARTS = (
-    "SELECT state, artifacts, error, options FROM jobs WHERE parent = %s AND kind = 'refine'"
-    " ORDER BY created_at, id"
-)
 JOINED_TO = ("poses.json", "report.json", "transforms.json")  # of a result whose poses stay
 VIDEO_FRAMES = "video_frames/"  # of a result: photos that its dataset holds as a video
 PANORAMA_VIEWS = "panorama_views/"  # of a result: what was cut from its dataset's panoramas
@@ -46,7 +42,7 @@ async def stage_job(
         found = await published_files(database, claim.fixed_from)
         await _stage_result(files, found, JOINED_TO, folder / "result")
     if claim.kind == "refine" and claim.parent is None:
-        if parts := await database.fetch(PARTS, claim.job_id):
+        if parts := await parts_of(database, claim.job_id):
             order["parts"] = "parts"
             await _stage_parts(files, parts, folder / "parts")
         elif claim.part_photos or settings.split_above:

@@ -208,3 +208,29 @@ def test_a_job_joins_a_finished_result_which_stays_as_long_as_it_is_needed(
     finished(http, job["id"])
     assert http.delete(f"/v1/jobs/{base['id']}").status_code == 204
     problem(joined(base["id"]), 404, "not_found")
+
+
+def test_the_parts_of_a_split_job_are_listed_with_it_alone(http: httpx.Client, scene: Path) -> None:
+    dataset = ready_dataset(http, scene)
+    body = {"dataset_id": dataset, "options": {"preset": "fast", "steps": 5, "seed": 1}, "part_photos": 20}
+    answer = http.post("/v1/jobs", json=body)
+    assert answer.status_code == 202
+    whole = finished(http, answer.json()["id"])
+    assert (whole["state"], whole["parts"]) == ("succeeded", {"parts": 3, "over": 3, "failed": 0})
+    parts = http.get(whole["links"]["parts"]).json()["items"]
+    assert [part["options"]["photos"] for part in parts] == [["a"], ["b"], ["c"]]
+    assert {(part["state"], part["parent"], part["parts"]) for part in parts} == {
+        ("succeeded", whole["id"], None)
+    }
+    listed_jobs = {
+        item["id"]: item["parts"] for item in http.get("/v1/jobs", params={"limit": 200}).json()["items"]
+    }
+    assert listed_jobs[whole["id"]] == whole["parts"]
+    assert not set(listed_jobs) & {part["id"] for part in parts}
+    assert http.get(whole["links"]["exports"]).json()["items"] == []
+    problem(http.post("/v1/jobs", json={**body, "part_photos": 5}), 422, "invalid_request")
+
+
+def test_most_jobs_have_no_parts(http: httpx.Client, done_job: dict[str, Any]) -> None:
+    assert done_job["parts"] is None
+    assert http.get(done_job["links"]["parts"]).json()["items"] == []

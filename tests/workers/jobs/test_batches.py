@@ -269,7 +269,7 @@ async def test_a_batch_is_cancelled_with_what_its_jobs_have(
     assert (asked_for.counts, asked_for.final) == ({"running": 1, "cancelled": 2}, False)
     ledger = Ledger(stores.jobs._database, claim, STALL_S)
     assert await ledger.wants_partial()
-    await ledger.cancelled([])
+    await ledger.cancelled([], ledger.claim.name)
     assert (await batches.cancel_batch(batch.id)).final
 
 

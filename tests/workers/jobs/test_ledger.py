@@ -175,7 +175,7 @@ async def test_nothing_is_written_once_another_attempt_owns_the_job(database: Da
         ledger.crashes(),
         ledger.publish([FILE], None),
         ledger.fail(ERROR, []),
-        ledger.cancelled([]),
+        ledger.cancelled([], ledger.claim.name),
         ledger.give_back(Requeue("requeued", {})),
     ):
         with pytest.raises(Fenced):
@@ -187,8 +187,9 @@ async def test_nothing_is_written_once_another_attempt_owns_the_job(database: Da
 async def test_a_cancellation_that_came_first_outweighs_each_other_end(stores: Stores, ledger: Ledger):
     await stores.jobs.cancel(ledger.claim.job_id)
     assert not await ledger.publish([FILE], None)
+    assert not await ledger.fail(ERROR, [])
     assert (await stores.jobs.get(ledger.claim.job_id)).state == "running", "the caller ends it"
-    await ledger.fail(ERROR, [])
+    await ledger.cancelled([], ledger.claim.name)
     job = await stores.jobs.get(ledger.claim.job_id)
     assert (job.state, job.error) == ("cancelled", None)
 

@@ -10,10 +10,11 @@ import psutil
 import pytest
 
 from biresnerf.options.refine_options import RefineOptions
-from tests.workers.conftest import Counting, Slots
+from tests.workers.conftest import Counting, Slots, claimed, taken_by_somebody
 from workers.engine import Stores
+from workers.jobs.ledger import Ledger
 from workers.records import Artifact
-from workers.run.attempt import OomKills, smaller_options
+from workers.run.attempt import Attempt, OomKills, smaller_options
 from workers.settings.settings import Settings
 
 pytestmark = pytest.mark.anyio
@@ -66,6 +67,7 @@ async def test_a_cancelled_job_leaves_its_best_poses_if_asked(
     report = await content(counting.stores, left["report.json"])
     assert report["state"] == "partial"
     assert ("previews" in left["poses.json"].key) == (fault is not None)
+    assert await counting.nobodys_files() == []
     for _ in range(3):  # what is kept is not collected with the rest
         assert (await content(counting.stores, left["poses.json"]))["step"] >= 5
 
@@ -95,7 +97,35 @@ async def test_a_cancelled_job_whose_result_nobody_wants_leaves_its_log_alone(
     job = await counting.until_final(timeout_s=10)
     assert (job.state, job.partial) == ("cancelled", False)
     assert set(await named(counting)) == {"log.txt"}
+    assert await counting.nobodys_files() == []
     assert not psutil.pid_exists(int(counting.starts()[0]["pid"]))
+
+
+@pytest.mark.parametrize("wanted", [True, False])
+async def test_of_a_result_that_was_stored_when_its_job_was_cancelled_only_what_is_wanted_stays(
+    counting: Counting, settings: Settings, tmp_path: Path, wanted: bool
+):
+    """Otherwise its files would be nobody's, and stay as long as the job."""
+    stores = counting.stores
+    await counting.submit(1, 0.0, poses=True)
+    await taken_by_somebody(stores.jobs._database)
+    claim = await claimed(stores.jobs._database, counting.id)
+    assert claim is not None
+
+    class CancelledAtTheEnd(Ledger):
+        async def publish(self, *given: object) -> bool:
+            await stores.jobs.cancel(counting.id, keep_partial=wanted)
+            return await super().publish(*given)
+
+    attempt = Attempt(stores.jobs._database, stores.files, settings, claim, tmp_path / "work", {})
+    attempt._ledger = CancelledAtTheEnd(stores.jobs._database, claim, settings.stall_s)
+    assert (await attempt.run()).how == "cancelled"
+    job = await stores.jobs.get(counting.id)
+    assert (job.state, job.partial) == ("cancelled", wanted)
+    assert set(await named(counting)) == (
+        {"log.txt", "poses.json", "renders/one.png", "report.json"} if wanted else {"log.txt"}
+    )
+    assert await counting.nobodys_files() == []
 
 
 async def test_the_log_can_be_followed_line_by_line(counting: Counting, settings: Settings, slots: Slots):

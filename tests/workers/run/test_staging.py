@@ -26,7 +26,7 @@ async def test_the_process_gets_the_options_that_were_sent_so_that_it_can_fill_i
     await taken_by_somebody(stores.jobs._database)
     claim = await claimed(stores.jobs._database, job.id)
     assert claim is not None
-    await stage_job(stores.jobs._database, stores.files, claim, tmp_path / "job")
+    await stage_job(stores.jobs._database, stores.files, settings, claim, tmp_path / "job")
     order = json.loads((tmp_path / "job" / "job.json").read_text())
     assert order["options"] == {"preset": "fast", "steps": 500}
     assert (tmp_path / "job" / "input" / "a.txt").read_bytes() == b"photo"
@@ -41,6 +41,6 @@ async def test_the_process_is_told_what_the_user_calls_the_set(
         await taken_by_somebody(stores.jobs._database)
         claim = await claimed(stores.jobs._database, job.id)
         assert claim is not None
-        await stage_job(stores.jobs._database, stores.files, claim, tmp_path / "job")
+        await stage_job(stores.jobs._database, stores.files, settings, claim, tmp_path / "job")
         order = json.loads((tmp_path / "job" / "job.json").read_text())
         assert order["title"] == name.get("name")
