@@ -141,6 +141,11 @@ def _line_of_event(event: StreamEvent) -> str | None:
         return f"Attempt {event.data.get('attempt')} crashed; the job continues from its last checkpoint."
     if event.kind == "retried_smaller":
         return "It ran out of memory; the job starts again with smaller settings."
+    said = event.data.get("data", {})
+    if event.kind == "split":
+        return f"Any workers refine the set in {said.get('parts')} parts; then the job joins them."
+    if event.kind == "part_over":
+        return f"{said.get('over')} of {said.get('parts')} parts are over."
     if event.kind == "cancel_requested":
         return "Cancellation was requested."
     return None

@@ -29,13 +29,15 @@ export function ResultSummary({ report, rows, cellOf, onSelect, actionsOf }: Res
   return (
     <section class="verdict" aria-label="Verdict">
       {(report.faults ?? []).length > 0 && (
-        <ul class="warnings faults" role="alert" aria-label="What failed">
-          {report.faults.map((fault) => (
-            <li key={fault.code}>
-              <strong>{fault.detail}</strong> {fault.hint}
-            </li>
-          ))}
-        </ul>
+        <div role="alert" aria-label="What failed">
+          <ul class="warnings faults">
+            {report.faults.map((fault) => (
+              <li key={fault.code}>
+                <strong>{fault.detail}</strong> {fault.hint}
+              </li>
+            ))}
+          </ul>
+        </div>
       )}
       <VerdictSentence report={report} />
       <FigureList figures={figuresOf(report, rows)} />

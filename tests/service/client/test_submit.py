@@ -132,6 +132,14 @@ def test_a_job_is_sent_with_its_limits_of_time(http: httpx.Client, service: Runn
         assert wrong[0] in refused.stderr or "deadline_refused" in refused.stderr
 
 
+def test_a_job_that_splits_itself_says_how_many_parts_are_over(service: Running, scene: Path) -> None:
+    done = submit(service, scene, *FAST, "--part-photos", "20", "--wait")
+    assert done.returncode == 0, done.stderr
+    lines = done.stderr.splitlines()
+    assert "Any workers refine the set in 3 parts; then the job joins them." in lines
+    assert [f"{n} of 3 parts are over." in lines for n in (1, 2, 3)] == [True] * 3
+
+
 def test_a_bad_scene_is_exit_2_and_leaves_no_dataset(
     http: httpx.Client, service: Running, scene: Path, tmp_path: Path
 ) -> None:

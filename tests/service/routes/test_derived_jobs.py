@@ -212,7 +212,7 @@ def test_a_job_joins_a_finished_result_which_stays_as_long_as_it_is_needed(
 
 def test_the_parts_of_a_split_job_are_listed_with_it_alone(http: httpx.Client, scene: Path) -> None:
     dataset = ready_dataset(http, scene)
-    body = {"dataset_id": dataset, "options": {"preset": "fast", "steps": 5, "seed": 1}, "part_photos": 20}
+    body = {"dataset_id": dataset, "options": {"preset": "fast", "steps": 20, "seed": 1}, "part_photos": 20}
     answer = http.post("/v1/jobs", json=body)
     assert answer.status_code == 202
     whole = finished(http, answer.json()["id"])

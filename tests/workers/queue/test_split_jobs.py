@@ -19,6 +19,7 @@ from tests.workers.conftest import Counting, Slots, claimed, quick_settings, rea
 from workers.database import job_queue
 from workers.engine import Stores
 from workers.jobs.derived_jobs import DerivedJobs
+from workers.jobs.job_expiry import expire_jobs
 from workers.jobs.job_states import finish, request_cancel
 from workers.jobs.ledger import Ledger
 from workers.settings.errors import Conflict
@@ -162,6 +163,34 @@ async def test_parts_are_cancelled_with_their_whole(stores: Stores, tmp_path: Pa
     assert [(part.state, part.cancel_requested) for part in after] == [
         ("succeeded", False), ("running", True), ("cancelled", True),
     ]  # fmt: skip
+
+
+async def test_a_job_that_was_cancelled_first_is_not_split(stores: Stores, counting: Counting) -> None:
+    await counting.submit(1, 0.0)
+    await taken_by_somebody(stores.jobs._database)
+    claim = await claimed(stores.jobs._database, counting.id)
+    assert claim is not None
+    await stores.jobs.cancel(counting.id)
+    assert not await Ledger(stores.jobs._database, claim, 60.0).split([{"photos": ["a.jpg"]}])
+    assert (await stores.jobs.get(counting.id)).state == "cancelled"
+    assert await parts_of(stores, counting.id) == ()
+
+
+async def test_a_part_keeps_its_result_until_the_whole_has_joined_it(stores: Stores, tmp_path: Path) -> None:
+    whole, parts = await split(stores, tmp_path, 2)
+    database = stores.jobs._database
+
+    async def expired() -> int:
+        async with database.transaction() as connection:
+            await connection.execute("UPDATE jobs SET expires_at = now() WHERE finished_at IS NOT NULL")
+            return await expire_jobs(connection, 10)
+
+    await end(stores, parts[0].id)
+    assert await expired() == 0
+    await end(stores, parts[1].id)
+    assert await expired() == 0
+    await end(stores, whole.id)
+    assert await expired() == 3
 
 
 async def test_a_janitor_cancels_the_parts_of_a_job_that_was_stopped_at_its_deadline(
