@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -110,6 +111,7 @@ def test_ctrl_c_just_before_a_wait_begins_is_noticed() -> None:
 
     def interrupt() -> None:
         stuck.wait(60)
+        time.sleep(0.5)  # until the call waits
         _thread.interrupt_main()
 
     with blocking(busy) as client:
