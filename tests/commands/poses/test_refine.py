@@ -58,7 +58,7 @@ def stop_after_checkpoint(scene: Path, output: Path, number: signal.Signals) -> 
     """Runs until the first checkpoint is there, sends the signal; exit status and what was said on stderr."""
     process = subprocess.Popen(command(scene, output), stderr=subprocess.PIPE, text=True)
     try:
-        end = time.monotonic() + 200
+        end = time.monotonic() + 400
         while not (output / CHECKPOINT).is_file():
             assert process.poll() is None, process.communicate()
             assert time.monotonic() < end
