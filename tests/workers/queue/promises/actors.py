@@ -201,13 +201,13 @@ class Actors:
             "fail",
             lambda: ledger.fail(error, []),
             model.failed(name, claim.token),
-            lambda _: "over",
+            lambda done: "over" if done else None,
         )
         if world.jobs[name].cancel_requested:
             yield self._write(
                 worker,
                 "cancelled",
-                lambda: ledger.cancelled([]),
+                lambda: ledger.cancelled([], claim.name),
                 model.ended_cancelled(name, claim.token),
                 lambda _: "over",
             )

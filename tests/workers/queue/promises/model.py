@@ -230,10 +230,7 @@ def failed(name: str, token: uuid.UUID) -> Change:
     return _owned(
         name,
         token,
-        lambda job: (
-            not job.cancel_requested,
-            job.ended("cancelled" if job.cancel_requested else "failed"),
-        ),
+        lambda job: (False, job) if job.cancel_requested else (True, job.ended("failed")),
         ends=True,
     )
 
