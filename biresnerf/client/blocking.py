@@ -21,8 +21,8 @@ from biresnerf.client.transport import ClientOptions
 
 P = ParamSpec("P")
 T = TypeVar("T")
+WAIT_S = 1.0  # at most, before Ctrl-C is noticed
 # From the event loop's thread to the calling thread; None is the last one.
-WAIT_S = 1.0
 _Messages: TypeAlias = SimpleQueue[Any]
 
 

@@ -208,8 +208,9 @@ class JobStore(OwnedStore):
             if row["state"] in ("queued", "running"):
                 raise Conflict("state_conflict", f"Job {job_id} is {row['state']}; cancel it first.")
             busy = await connection.row(
-                "SELECT id FROM jobs WHERE (parent = %s OR fixed_from = %s) AND state IN ('queued', 'running')",
-                *(job_id, job_id),
+                "SELECT id FROM jobs WHERE state IN ('queued', 'running') AND (parent = %s OR fixed_from = %s"
+                " OR id = (SELECT parent FROM jobs WHERE id = %s AND kind = 'refine'))",
+                *(job_id, job_id, job_id),
             )
             if busy is not None:
                 raise Conflict(

@@ -187,6 +187,8 @@ async def test_a_part_keeps_its_result_until_the_whole_has_joined_it(stores: Sto
 
     await end(stores, parts[0].id)
     assert await expired() == 0
+    with pytest.raises(Conflict):
+        await stores.jobs.delete(parts[0].id)
     await end(stores, parts[1].id)
     assert await expired() == 0
     await end(stores, whole.id)
