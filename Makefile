@@ -57,7 +57,7 @@ test-pythons:  ## the tests with each later Python that is found here, in enviro
 build/lowest.txt: pyproject.toml
 	@mkdir -p build
 	$(PYTHON) -c 'import re, tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; print(*sorted({\
-	  "==".join(re.match(r"([\w-]+)[^>]*>=([\d.]+)", r).groups()) for r in sum(p["optional-dependencies"].values(), p["dependencies"])}), sep="\n")' > $@
+	  "==".join(re.match(r"([\w-]+)[^>]*>=([\d.]+)", r).groups()) for r in sum(p["optional-dependencies"].values(), p["dependencies"]) if ">=" in r}), sep="\n")' > $@
 
 coverage: web  ## all tests with branch coverage, printed by file; in build/coverage as HTML
 	$(BIN)/python -m pytest -n $(TEST_PROCESSES) --maxprocesses 4 --dist loadfile --no-loadscope-reorder --cov --cov-report=term \

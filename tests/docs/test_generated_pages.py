@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from importlib.metadata import version
 
 import click
 import pytest
@@ -16,6 +17,11 @@ from workers.settings.settings import Settings
 
 @pytest.mark.parametrize("path", GENERATED, ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_what_is_generated_has_not_drifted(path):
+    if (
+        path.suffix == ".json"
+        and f"\npydantic=={version('pydantic')}\n" not in (ROOT / "constraints.txt").read_text()
+    ):
+        pytest.skip("another pydantic than the pinned one writes another schema")
     assert path.read_text("utf-8") == GENERATED[path](), "run `make docs`"
 
 

@@ -25,7 +25,9 @@ def kernel(request: pytest.FixtureRequest):
     if request.param == "cpu":
         return directions_for(torch.device("cpu")), torch.device("cpu")
     pytest.importorskip(
-        "triton", reason="the CUDA backend's kernels need Triton, which exists for Linux only"
+        "triton",
+        minversion="3.2",
+        reason="the CUDA backend's kernels need Triton, for Linux only; its interpreter runs them from 3.2 on",
     )
     module = importlib.import_module("biresnerf.field.cuda.cameras.lens")
     return module.directions_in_cam, torch.device("cuda" if torch.cuda.is_available() else "cpu")

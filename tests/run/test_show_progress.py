@@ -51,7 +51,7 @@ def test_a_terminal_has_one_bar_with_the_time_left_and_news_above_it(monkeypatch
     said = shown(monkeypatch, terminal, 5)
     drawn = said.split("\r")
     assert "resuming at step 3\n" in said
-    assert re.search(r"coarse  40 %\|#+ +\| 00:0\d, step 2/5  train PSNR 12\.5 dB  0:45 left", said)
+    assert re.search(r"coarse  40 %\|[#█]+ +\| 00:0\d, step 2/5  train PSNR 12\.5 dB  0:45 left", said)
     assert any(part.strip() == "a word of the log" for part in re.split(r"[\r\n]", said))
     assert drawn[-1].strip() == "", "the bar leaves nothing behind"
 

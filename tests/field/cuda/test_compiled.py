@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-pytest.importorskip("triton", reason="the CUDA backend's kernels need Triton, which exists for Linux only")
+pytest.importorskip("triton", minversion="3.6", reason="what kernels take is known for Triton 3.6 and later")
 
 pytestmark = pytest.mark.slow
 
