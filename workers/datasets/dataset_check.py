@@ -150,7 +150,7 @@ class Checker:
         """
         async with locked_folder(self._settings.scratch_dir / CHECKS) as folder:
             dataset, errors = folder / "input", folder / "log.txt"
-            await self._files.stage(members, dataset)
+            await self._files.stage(members, dataset, to_read_only=True)
             try:
                 async with counted(self._database, "datasets.check_losses", take.dataset_id):
                     outcome, killed = await _run(dataset, errors, self._settings, take)

@@ -52,7 +52,8 @@ async def stage_job(
         rows = await database.fetch(
             "SELECT key, path FROM dataset_files WHERE dataset_id = %s", claim.dataset_id
         )
-        await files.stage(((row["key"], row["path"]) for row in rows), folder / "input")
+        photos = ((row["key"], row["path"]) for row in rows)
+        await files.stage(photos, folder / "input", to_read_only=True)
     if claim.kind == "export" and _needs_photos(claim.options["formats"]):
         found = await _parents_files(database, claim)
         for kind, place in ((VIDEO_FRAMES, "input"), (PANORAMA_VIEWS, "result")):

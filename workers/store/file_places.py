@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,6 +35,12 @@ class Place(Protocol):
 
     async def signed_urls(self, method: Method, keys: Sequence[str], valid_s: int) -> Sequence[str] | None:
         """URLs with which anybody may read or write these keys; None if the place has no such URLs."""
+
+    async def link(self, key: str, target: Path) -> bool:
+        """Give the file a second name at ``target``; False where that cannot be."""
+
+    def links_into(self, folder: Path) -> bool:
+        """Whether `link` can be expected to work there."""
 
     def attributes(self, media_type: str | None) -> dict[str, str] | None:
         """Attributes to store with a file, for clients that read it directly from the place."""
@@ -74,6 +81,18 @@ class LocalPlace:
     async def signed_urls(self, method: Method, keys: Sequence[str], valid_s: int) -> Sequence[str] | None:
         """None: only we serve a folder."""
         return None
+
+    async def link(self, key: str, target: Path) -> bool:
+        """False on another file system, and for a key that the store writes otherwise."""
+        try:
+            await asyncio.to_thread(os.link, self.root / key, target)
+        except OSError:
+            return False
+        return True
+
+    def links_into(self, folder: Path) -> bool:
+        """On the same disk."""
+        return folder.stat().st_dev == self.root.stat().st_dev
 
     def attributes(self, media_type: str | None) -> dict[str, str] | None:
         """None: a folder keeps bytes only."""
@@ -151,6 +170,14 @@ class BucketPlace:
     async def signed_urls(self, method: Method, keys: Sequence[str], valid_s: int) -> Sequence[str] | None:
         """Signed locally with the secret key, without a request."""
         return await obstore.sign_async(self._signer, method, keys, timedelta(seconds=valid_s))
+
+    async def link(self, key: str, target: Path) -> bool:
+        """False: nothing of a bucket is on this machine."""
+        return False
+
+    def links_into(self, folder: Path) -> bool:
+        """False."""
+        return False
 
     def attributes(self, media_type: str | None) -> dict[str, str] | None:
         """Always an attachment: users' files must not run as pages of the store's origin."""

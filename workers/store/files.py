@@ -196,16 +196,27 @@ class FileStore:
             digest.update(chunk)
         return digest.hexdigest()
 
-    async def stage(self, files: Iterable[tuple[str, str]], folder: Path) -> int:
-        """Copy files, given as (key, path relative to ``folder``), into a local folder; returns the bytes."""
+    async def stage(
+        self, files: Iterable[tuple[str, str]], folder: Path, *, to_read_only: bool = False
+    ) -> int:
+        """Copy files, given as (key, path relative to ``folder``), into a local folder; returns the bytes copied.
+
+        Files ``to_read_only`` are linked where the place allows that: whoever stages them must not write into them.
+        """
         total = 0
         for key, relative in files:
             target = folder / _checked(relative)
             target.parent.mkdir(parents=True, exist_ok=True)
+            if to_read_only and await self._place.link(_checked(key), target):
+                continue
             with target.open("wb") as out:
                 async for chunk in self.read(key):
                     total += await asyncio.to_thread(out.write, chunk)
         return total
+
+    def links_into(self, folder: Path) -> bool:
+        """Whether files staged `to_read_only` take no room in the folder."""
+        return self._place.links_into(folder)
 
     async def signed_urls(self, method: Method, keys: Sequence[str], valid_s: int) -> Sequence[str] | None:
         """A URL for each key, valid for ``valid_s`` and one method; None if the place has no such URLs."""

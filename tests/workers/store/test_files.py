@@ -158,6 +158,21 @@ async def test_staging_copies_into_folders(files: FileStore, tmp_path: Path):
     assert (tmp_path / "out/images/ü.png").read_bytes() == b"abc"
 
 
+async def test_files_to_read_only_take_no_room_in_a_folder_beside_the_store(tmp_path: Path):
+    files = FileStore(LocalPlace(tmp_path / "store"))
+    await put(files, "d/v/images/ü #1%.png", b"abc")
+    await put(files, "d/v/images/b.png", b"abc")
+    members = [("d/v/images/ü #1%.png", "a.png"), ("d/v/images/b.png", "images/b.png")]
+    assert files.links_into(tmp_path)
+    await files.stage(members, tmp_path / "out", to_read_only=True)
+    assert (tmp_path / "out/a.png").read_bytes() == (tmp_path / "out/images/b.png").read_bytes() == b"abc"
+    assert (tmp_path / "out/images/b.png").stat().st_nlink == 2, "one file, two names"
+    await put(files, "d/v/images/b.png", b"new")
+    assert (tmp_path / "out/images/b.png").read_bytes() == b"abc", "a job keeps what it was given"
+    await files.delete_prefix("d")
+    assert (tmp_path / "out/images/b.png").read_bytes() == b"abc"
+
+
 async def test_a_working_store_is_healthy(files: FileStore):
     assert await files.healthy()
 
