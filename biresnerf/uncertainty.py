@@ -164,6 +164,14 @@ class PartsReport(FrozenModel):
     parts: tuple[PartReport, ...]
     seams: tuple[SeamReport, ...] = ()
     photos_left_out: int = Field(0, description="Which no part that joined has placed.")
+    part_of: tuple[int | None, ...] = Field(
+        (), description="Of each image: the part that its pose was taken from, counted from 0; None: of none."
+    )
+    apart_deg: tuple[float | None, ...] = Field(
+        (),
+        description="Of each image: rotation between its poses by the two parts that disagree most on it, degrees. "
+        "None where one part alone has it.",
+    )
 
     def doubts(self) -> tuple[str, ...]:
         """What did not join, and seams at which most photos disagree by more than the parts' bounds allow."""

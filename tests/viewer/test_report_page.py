@@ -212,6 +212,8 @@ def stated_page(browser, result, tmp_path_factory):
                 parts=("a", "b"), photos=2, rotation_deg=0.021, rotation_deg_worst=0.43, position=1, position_worst=2
             ),
         ),
+        part_of=(0,) * 5 + (1,) * (len(images) - 5),
+        apart_deg=(None,) * 4 + (0.43, 0.01) + (None,) * (len(images) - 6),
     )  # fmt: skip
     write_report_html(folder, result.report.model_copy(update={"images": images, "parts": parts}))
     opened = open_report(browser, folder / "report.html")
@@ -227,9 +229,22 @@ def test_the_page_says_how_well_the_parts_agree_that_a_set_was_joined_from(state
 
     assert said(stated)["Parts agree to"] == [
         "0.021°",
-        "on shared photos, 0.43° at most; 2 of 3 parts joined",
+        "on shared photos, 0.43° at most (a, b); 2 of 3 parts joined",
     ]
     assert "Parts agree to" not in said(opened.page)
+
+
+def test_the_map_shows_the_parts_and_where_they_disagree(stated, opened):
+    def offered(page) -> list[str]:
+        return page.get_by_label("Colour").locator("option").all_text_contents()
+
+    assert offered(stated) == [*offered(opened.page), "part", "parts disagree (°)"]
+    stated.get_by_label("Colour").select_option("part")
+    legend = stated.locator(".scene .legend")
+    assert [entry.text_content().strip() for entry in legend.locator("li").all()] == ["a", "b"]
+    stated.get_by_label("Colour").select_option("parts_apart_deg")
+    assert "in one part" in legend.text_content()
+    assert "≥ 0.1" in legend.text_content()
 
 
 def test_the_table_says_how_exact_each_pose_is_and_finds_those_not_known(stated):

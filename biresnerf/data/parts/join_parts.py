@@ -159,9 +159,10 @@ def join(photos: int, parts: Sequence[PartResult]) -> tuple[MappedModel, PartsRe
     while left:
         following = max(left, key=lambda k: rig.shared(parts[k]))
         left.remove(following)
-        why_not[following] = rig.take(parts[following])
+        why_not[following] = rig.take(parts[following], following)
+    apart_deg = np.full(photos, np.nan)
     joined = [part for k, part in enumerate(parts) if why_not[k] is None]
-    seams = [_seam(a, b) for a, b in combinations(joined, 2) if _common(a, b) >= JUDGED_FROM]
+    seams = [_seam(a, b, apart_deg) for a, b in combinations(joined, 2) if _common(a, b) >= JUDGED_FROM]
     report = PartsReport(
         parts=tuple(
             PartReport(name=part.name, photos=len(part.model.rows), why_not=why_not[k])
@@ -169,6 +170,8 @@ def join(photos: int, parts: Sequence[PartResult]) -> tuple[MappedModel, PartsRe
         ),
         seams=tuple(seams),
         photos_left_out=int(photos - rig.placed.sum()),
+        part_of=tuple(k if k >= 0 else None for k in rig.part.tolist()),
+        apart_deg=tuple(None if np.isnan(each) else each for each in apart_deg.tolist()),
     )
     return _one_model(rig, [part.model for part in joined]), report
 
@@ -179,21 +182,23 @@ def _common(a: PartResult, b: PartResult) -> int:
 
 @dataclass(frozen=True, eq=False)
 class _Rig:
-    """The cameras of the whole set as far as they are joined: poses, which are placed, and their bounds (rad)."""
+    """The cameras of the whole set as far as they are joined: poses, which are placed, their bounds (rad) and parts."""
 
     poses: NDArray[np.float64]
     placed: NDArray[np.bool_]
     bound: NDArray[np.float64]
+    part: NDArray[np.int64]
 
     @classmethod
     def empty(cls, photos: int) -> _Rig:
-        return cls(np.tile(np.eye(4), (photos, 1, 1)), np.zeros(photos, np.bool_), np.full(photos, np.inf))
+        poses, of_none = np.tile(np.eye(4), (photos, 1, 1)), np.full(photos, -1)
+        return cls(poses, np.zeros(photos, np.bool_), np.full(photos, np.inf), of_none)
 
     def shared(self, part: PartResult) -> int:
         """How many of the part's photos are placed."""
         return int(self.placed[part.model.rows].sum())
 
-    def take(self, part: PartResult) -> str | None:
+    def take(self, part: PartResult, number: int) -> str | None:
         """Carry a part onto what is there by the photos that both have; or why that cannot be. It is not forced."""
         rows, found = part.model.rows, self.poses.copy()
         if part.tracks is None:
@@ -212,6 +217,7 @@ class _Rig:
         better = trusted & (~self.placed[rows] | (bound < self.bound[rows]))
         taken = rows[better]
         self.poses[taken], self.placed[taken], self.bound[taken] = found[taken], True, bound[better]
+        self.part[taken] = number
         return None
 
 
@@ -231,14 +237,18 @@ def _one_model(rig: _Rig, models: Sequence[MappedModel]) -> MappedModel:
     return MappedModel(PARTS, np.flatnonzero(rig.placed), rig.poses[rig.placed], lenses, points, seen, error)
 
 
-def _seam(a: PartResult, b: PartResult) -> SeamReport:
-    """How far two parts disagree on the photos that both have, once one is carried onto the other by them."""
-    _, in_a, in_b = np.intersect1d(a.model.rows, b.model.rows, return_indices=True)
+def _seam(a: PartResult, b: PartResult, apart_deg: NDArray[np.float64]) -> SeamReport:
+    """How far two parts disagree on the photos that both have, once one is carried onto the other by them.
+
+    ``apart_deg`` [n] of these photos becomes at least what they disagree by.
+    """
+    rows, in_a, in_b = np.intersect1d(a.model.rows, b.model.rows, return_indices=True)
     there, here = a.model.world_from_cam[in_a], b.model.world_from_cam[in_b]
     a_from_b = align_robust(here, there, with_rotations=True)
     here = a_from_b.apply_to_poses(here)
     turned = rotation_between_deg(here, there)
     shifted = np.linalg.norm(here[:, :3, 3] - there[:, :3, 3], axis=1)
+    apart_deg[rows] = np.fmax(apart_deg[rows], turned)
     bounds = np.hypot(a.bounds[in_a], b.bounds[in_b] * [1.0, a_from_b.scale])
     known = np.isfinite(bounds).all(1)
     within = np.column_stack([np.radians(turned), shifted]) <= bounds

@@ -25,6 +25,10 @@ export interface SceneCamera {
   readonly moved_units: number;
   /** PSNR on refined poses minus on the input's, dB, in the verdict's trainings; null if not measured. */
   readonly delta_psnr: number | null;
+  /** The part of a large set that its pose was taken from; null if there are no parts, or it is of none. */
+  readonly part: string | null;
+  /** By how much parts disagree on it; null if at most one has it. */
+  readonly parts_apart_deg: number | null;
   readonly flags: readonly string[];
   /** What is said of the returned pose; null if nothing was. */
   readonly uncertainty: ImageReport["uncertainty"];
@@ -78,6 +82,7 @@ export interface SheetCell {
 /** Cameras before and after, joined by index with the report: both files keep the input's order. */
 function camerasOf(poses: PosesDocument, report: Report | null): SceneCamera[] {
   const borders = poses.cameras.map(bordersOf);
+  const joined = report?.parts;
   return poses.images.map((image, index) => {
     const before = image.world_from_cam_before;
     const after = image.world_from_cam;
@@ -92,6 +97,8 @@ function camerasOf(poses: PosesDocument, report: Report | null): SceneCamera[] {
       moved_deg: before ? turnDeg(before, after) : (measures?.moved_deg ?? 0),
       moved_units: before ? length(minus(centreOf(after), centreOf(before))) : (measures?.moved_units ?? 0),
       delta_psnr: measured ? (measures.trial_psnr_after ?? 0) - (measures.trial_psnr_before ?? 0) : null,
+      part: joined?.parts[joined.part_of?.[index] ?? -1]?.name ?? null,
+      parts_apart_deg: joined?.apart_deg?.[index] ?? null,
       flags: image.flags,
       uncertainty: measures?.uncertainty ?? null,
       returned: (report?.verdict ?? report?.verdict_so_far)?.returned === "input" && before ? before : after,

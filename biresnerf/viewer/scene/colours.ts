@@ -1,7 +1,7 @@
 // Colours of values on absolute scales: the same value has the same colour in every job.
 import type { SceneCamera } from "../result/widget_data";
 
-export type ColourBy = "moved_deg" | "moved_units" | "delta_psnr" | "source";
+export type ColourBy = "moved_deg" | "moved_units" | "delta_psnr" | "source" | "part" | "parts_apart_deg";
 export type Colour = readonly [number, number, number]; // 0 to 255
 
 /** `#rrggbb` as numbers. */
@@ -65,7 +65,22 @@ export function scaleOf(by: ColourBy, spread: number): Scale {
     moved_units: { label: "moved", unit: "units", caps: unitCaps(spread), signed: false },
     delta_psnr: { label: "PSNR gain", unit: "dB", caps: [3, 1, 10], signed: true },
     source: { label: "source of the pose", unit: "", caps: [], signed: false },
+    part: { label: "part", unit: "", caps: [], signed: false },
+    parts_apart_deg: { label: "parts disagree", unit: "°", caps: [0.1, 0.01, 1, 10], signed: false },
   }[by];
+}
+
+/** What cameras can be coloured by: some need poses before, some a set that was refined in parts. */
+export function coloursOf(cameras: readonly SceneCamera[]): readonly [ColourBy, ...ColourBy[]] {
+  const compared = cameras.some(({ before }) => before !== null);
+  const parted: ColourBy[] = cameras.some(({ part }) => part !== null) ? ["part", "parts_apart_deg"] : [];
+  return compared ? ["moved_deg", "moved_units", "delta_psnr", "source", ...parted] : ["source", ...parted];
+}
+
+/** The names that have a colour each; none where the colour is of a number. */
+export function kindsOf(cameras: readonly SceneCamera[], by: ColourBy): string[] {
+  if (by !== "source" && by !== "part") return [];
+  return [...new Set(cameras.map((camera) => camera[by]))].filter((kind) => kind !== null).sort();
 }
 
 /** Round numbers near a tenth of the cameras' spread, in world units. */
@@ -75,7 +90,7 @@ function unitCaps(spread: number): number[] {
 }
 
 export function colourOf(camera: SceneCamera, by: ColourBy, cap: number, kinds: readonly string[], dark: boolean): Colour {
-  if (by === "source") return kindColour(camera.source, kinds);
+  if (by === "source" || by === "part") return kindColour(camera[by] ?? "", kinds);
   const value = camera[by];
   if (value === null || !Number.isFinite(value)) return UNKNOWN;
   return by === "delta_psnr" ? signedColour(value / cap, dark) : rampColour(value / cap, dark);

@@ -19,10 +19,11 @@ interface SceneChoice {
 
 export const FIRST_CHOICE: SceneChoice = { lines: 1, before: true, uncertainty: false, photos: true, by: "moved_deg", caps: {}, layer: null };
 
-const COLOURS = (["moved_deg", "moved_units", "delta_psnr", "source"] as const).map((value) => {
+const colourOption = (value: ColourBy) => {
   const { label, unit } = scaleOf(value, 1);
   return { value, text: unit ? `${label} (${unit})` : label };
-});
+};
+const MOST_NAMED = 6; // kinds that have colours of their own
 
 const LAYERS: Readonly<Record<PointLayer["source"], string>> = {
   given: "the input's points",
@@ -38,13 +39,16 @@ export function layerOf(points: readonly PointLayer[], chosen: string | null): P
   return points.find((layer) => layer.source === "field") ?? points[0] ?? null;
 }
 
-export const capOf = (choice: SceneChoice, spread: number): number =>
-  choice.caps[choice.by] ?? scaleOf(choice.by, spread).caps[0] ?? 1;
+export const capOf = (choice: SceneChoice, by: ColourBy, spread: number): number =>
+  choice.caps[by] ?? scaleOf(by, spread).caps[0] ?? 1;
 
 export function SceneControls(props: {
   choice: SceneChoice;
   onChange: (changed: Partial<SceneChoice>) => void;
   points: readonly PointLayer[];
+  /** What cameras can be coloured by, and what they are. */
+  colours: readonly ColourBy[];
+  by: ColourBy;
   spread: number;
   /** How many times too large ellipsoids are; null if there are none. */
   exaggerated: number | null;
@@ -53,17 +57,19 @@ export function SceneControls(props: {
   /** Whether there are photos for the frusta. */
   pictured: boolean;
 }) {
-  const { choice, onChange, points, spread, exaggerated, compared } = props;
-  const scale = scaleOf(choice.by, spread);
+  const { choice, onChange, points, by, spread, exaggerated, compared } = props;
+  const scale = scaleOf(by, spread);
   const caps = [...scale.caps].sort((a, b) => a - b);
   return (
     <div class="scene-controls">
-      {compared && <Pick<ColourBy> label="Colour" value={choice.by} onChange={(by) => onChange({ by })} options={COLOURS} />}
-      {compared && caps.length > 0 && (
+      {props.colours.length > 1 && (
+        <Pick<ColourBy> label="Colour" value={by} onChange={(wanted) => onChange({ by: wanted })} options={props.colours.map(colourOption)} />
+      )}
+      {caps.length > 0 && (
         <Pick
           label="up to"
-          value={capOf(choice, spread)}
-          onChange={(cap) => onChange({ caps: { ...choice.caps, [choice.by]: cap } })}
+          value={capOf(choice, by, spread)}
+          onChange={(cap) => onChange({ caps: { ...choice.caps, [by]: cap } })}
           options={caps.map((value) => ({ value, text: `${value} ${scale.unit}` }))}
         />
       )}
@@ -106,12 +112,13 @@ export function SceneControls(props: {
 export function Legend(props: { by: ColourBy; cap: number; kinds: readonly string[]; dark: boolean; unknown: boolean }) {
   const { by, cap, kinds, dark } = props;
   const scale = scaleOf(by, 1);
-  if (by === "source") {
+  if (by === "source" || by === "part") {
+    if (kinds.length > MOST_NAMED) return <div class="legend">{kinds.length} parts, in colours that repeat</div>;
     return (
       <ul class="legend">
         {kinds.map((kind) => (
           <li key={kind}>
-            <i style={{ background: css(kindColour(kind, kinds)) }} /> {sourceWords(kind)}
+            <i style={{ background: css(kindColour(kind, kinds)) }} /> {by === "part" ? kind : sourceWords(kind)}
           </li>
         ))}
       </ul>
@@ -129,9 +136,9 @@ export function Legend(props: { by: ColourBy; cap: number; kinds: readonly strin
         <span>{scale.signed ? `≤ −${cap}` : "0"}</span>
         <span>≥ {cap}</span>
       </span>
-      {by === "delta_psnr" && props.unknown && (
+      {props.unknown && (
         <span class="legend-note">
-          <i style={{ background: css(UNKNOWN) }} /> not measured
+          <i style={{ background: css(UNKNOWN) }} /> {by === "parts_apart_deg" ? "in one part" : "not measured"}
         </span>
       )}
     </div>

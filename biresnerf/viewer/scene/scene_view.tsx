@@ -7,7 +7,7 @@ import { fixed, short } from "../widgets/numbers";
 import { themeColour, useDark, useReducedMotion } from "../widgets/theme";
 import { sourceWords } from "../widgets/words";
 import { CameraTable } from "./camera_table";
-import { colourOf, hexColour } from "./colours";
+import { colourOf, coloursOf, hexColour, kindsOf } from "./colours";
 import { exaggerationOf } from "./ellipsoids";
 import type { Look } from "./geometry";
 import { capOf, FIRST_CHOICE, layerOf, Legend, SceneControls } from "./scene_controls";
@@ -43,16 +43,18 @@ export function SceneView(props: SceneViewProps) {
     const centres = cameras.map((camera) => centreOf(camera.after));
     return spreadOf(centres, medianOf(centres));
   }, [cameras]);
-  const kinds = useMemo(() => [...new Set(cameras.map((camera) => camera.source))].sort(), [cameras]);
-  const cap = capOf(choice, spread);
+  const offered = useMemo(() => coloursOf(cameras), [cameras]);
+  const by = offered.includes(choice.by) ? choice.by : offered[0];
+  const kinds = useMemo(() => kindsOf(cameras, by), [cameras, by]);
+  const cap = capOf(choice, by, spread);
   const painted = useMemo(
     () => ({
-      colours: cameras.map((camera) => colourOf(camera, compared ? choice.by : "source", cap, kinds, dark)),
+      colours: cameras.map((camera) => colourOf(camera, by, cap, kinds, dark)),
       gridColour: hexColour(themeColour("--line-strong")),
       beforeColour: hexColour(themeColour("--before")),
       selectedColour: hexColour(themeColour("--accent")),
     }),
-    [cameras, compared, choice.by, cap, kinds, dark],
+    [cameras, by, cap, kinds, dark],
   );
   const layer = layerOf(points, choice.layer);
   const { lines, before, photos } = choice;
@@ -79,7 +81,8 @@ export function SceneView(props: SceneViewProps) {
   return (
     <section class="scene" aria-label="Cameras in three dimensions">
       <SceneControls
-        {...{ choice, points, spread, compared, pictured }}
+        {...{ choice, points, by, spread, compared, pictured }}
+        colours={offered}
         exaggerated={times}
         onChange={(changed) => setChoice({ ...choice, ...changed })}
       />
@@ -103,7 +106,7 @@ export function SceneView(props: SceneViewProps) {
           event.preventDefault();
         }}
       >
-        <Legend {...{ by: compared ? choice.by : "source", cap, kinds, dark }} unknown={cameras.some((camera) => camera.delta_psnr === null)} />
+        <Legend {...{ by, cap, kinds, dark }} unknown={cameras.some((camera) => camera[by] === null)} />
       </div>
       {compared && (
         <label class="scene-slider">

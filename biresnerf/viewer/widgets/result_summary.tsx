@@ -174,11 +174,11 @@ function moreFiguresOf(report: Report, rows: readonly ImageRow[]): Figure[] {
 /** How well the parts agree that a large set was joined from. */
 function partsFigure({ parts, seams = [] }: PartsReport): Figure {
   const joined = `${parts.filter(({ why_not }) => why_not == null).length} of ${count(parts.length, "part")} joined`;
-  const worst = Math.max(...seams.map((seam) => seam.rotation_deg_worst));
+  const [worst] = [...seams].sort((a, b) => b.rotation_deg_worst - a.rotation_deg_worst);
   return {
     name: "Parts agree to",
-    value: seams.length ? `${short(median(seams.map((seam) => seam.rotation_deg)), 2)}°` : "–",
-    note: seams.length ? `on shared photos, ${short(worst, 2)}° at most; ${joined}` : joined,
+    value: worst ? `${short(median(seams.map((seam) => seam.rotation_deg)), 2)}°` : "–",
+    note: worst ? `on shared photos, ${short(worst.rotation_deg_worst, 2)}° at most (${worst.parts.join(", ")}); ${joined}` : joined,
   };
 }
 

@@ -18,6 +18,7 @@ export function GivenCameras({ photos: { list, cellOf }, converted = false }: { 
       return {
         ...{ name, before: null, after: pose, returned: pose, source: "given", borders: borders[camera]! },
         ...{ moved_deg: 0, moved_units: 0, delta_psnr: null, flags: [], uncertainty: null },
+        ...{ part: null, parts_apart_deg: null },
       };
     });
   }, [list, posed, converted]);

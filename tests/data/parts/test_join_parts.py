@@ -60,6 +60,10 @@ def test_parts_in_frames_of_their_own_become_one_rig(truth: NDArray[np.float64])
         ("part-0", "part-1"): 6,
         ("part-1", "part-2"): 6,
     }
+    assert report.part_of[:12] == (report.part_of[0],) * 12
+    assert {report.part_of[0], report.part_of[20], report.part_of[39]} == {0, 1, 2}
+    shared = {*range(12, 18), *range(24, 30)}
+    assert {row for row, apart in enumerate(report.apart_deg) if apart is not None} == shared
 
 
 def test_a_part_that_contradicts_the_others_or_shares_too_little_stays_out(
@@ -79,6 +83,7 @@ def test_a_part_that_contradicts_the_others_or_shares_too_little_stays_out(
     }  # fmt: skip
     np.testing.assert_array_equal(model.rows, np.arange(20))
     assert report.photos_left_out == 20
+    assert report.part_of == (0,) * 20 + (None,) * 20
     assert len(report.doubts()) == 4
     assert "far" in report.doubts()[1]
 
@@ -93,7 +98,8 @@ def test_of_a_shared_photo_the_pose_with_the_smaller_bound_is_taken(truth: NDArr
     rough = truth[:24].copy()
     rough[:, :3, :3] = rotation_of(np.random.default_rng(0).normal(0, 0.01, (24, 3))) @ rough[:, :3, :3]
     parts = [part("rough", np.arange(24), rough, 0.02), part("fine", np.arange(12, 30), truth[12:30], 0.001)]
-    model, _ = join(COUNT, parts)
+    model, report = join(COUNT, parts)
+    assert report.part_of == (0,) * 12 + (1,) * 18 + (None,) * 10
     found = model.world_from_cam[:, :3, :3]
     relative = np.swapaxes(found[12:29], 1, 2) @ found[13:30]
     expected = np.swapaxes(truth[12:29, :3, :3], 1, 2) @ truth[13:30, :3, :3]
@@ -123,6 +129,7 @@ def test_seams_measure_the_noise_of_parts_and_hold_where_bounds_are_honest(
         # The median length of three deviates of sqrt(2) times the noise: 1.538 of them.
         assert seam.rotation_deg == pytest.approx(np.degrees(1.538 * np.sqrt(2) * noise), rel=0.35)
         assert seam.position == pytest.approx(1.538 * np.sqrt(2) * noise, rel=0.35)
+        assert max(apart or 0 for apart in report.apart_deg) == pytest.approx(seam.rotation_deg_worst)
         assert seam.within is not None
         shares.append(seam.within)
     assert 0.8 < np.mean(shares) < 0.98
