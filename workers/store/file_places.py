@@ -83,9 +83,15 @@ class LocalPlace:
         return None
 
     async def link(self, key: str, target: Path) -> bool:
-        """False on another file system, and for a key that the store writes otherwise."""
+        """False on another file system, for a link, and for a key that the store writes otherwise."""
+        return await asyncio.to_thread(self._linked, self.root / key, target)
+
+    @staticmethod
+    def _linked(source: Path, target: Path) -> bool:
         try:
-            await asyncio.to_thread(os.link, self.root / key, target)
+            if source.is_symlink():  # it would be linked itself
+                return False
+            os.link(source, target)
         except OSError:
             return False
         return True
