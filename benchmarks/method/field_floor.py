@@ -1,8 +1,8 @@
 """How near to the truth the field's own optimum lies: ``python -m benchmarks.method.field_floor SET...``.
 
 SET holds true poses. One run starts from them and holds them for half of its steps: freed, they go where photos and
-field want them. Another starts from noise. Neither adjusts all cameras. What one end is nearer than the other is lost
-on the way, and not missing in the photos.
+field want them. Another starts from noise. Neither adjusts all cameras. The difference between their errors is lost on
+the way, and not missing from the photos.
 """
 
 from __future__ import annotations
@@ -37,7 +37,10 @@ class HeldFirst(Schedule):
 
 
 def field_end(
-    start: Dataset, method: Method, options: dict[str, object], seen: Callable[[Array], object] = len
+    start: Dataset,
+    method: Method,
+    options: dict[str, object],
+    seen: Callable[[Array], object] = lambda _poses: None,
 ) -> Array:
     """The poses [n, 4, 4] that the run of a field ends with; ``seen`` gets those at each check."""
     ends: list[Array] = []

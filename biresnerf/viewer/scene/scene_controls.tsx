@@ -23,7 +23,7 @@ const colourOption = (value: ColourBy) => {
   const { label, unit } = scaleOf(value, 1);
   return { value, text: unit ? `${label} (${unit})` : label };
 };
-const MOST_NAMED = 6; // kinds that have colours of their own
+const MOST_NAMED = 6; // parts that have colours of their own
 
 const LAYERS: Readonly<Record<PointLayer["source"], string>> = {
   given: "the input's points",
@@ -113,7 +113,7 @@ export function Legend(props: { by: ColourBy; cap: number; kinds: readonly strin
   const { by, cap, kinds, dark } = props;
   const scale = scaleOf(by, 1);
   if (by === "source" || by === "part") {
-    if (kinds.length > MOST_NAMED) return <div class="legend">{kinds.length} parts, in colours that repeat</div>;
+    if (by === "part" && kinds.length > MOST_NAMED) return <div class="legend">{kinds.length} parts, in colours that repeat</div>;
     return (
       <ul class="legend">
         {kinds.map((kind) => (
