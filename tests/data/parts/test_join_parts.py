@@ -106,6 +106,24 @@ def test_of_a_shared_photo_the_pose_with_the_smaller_bound_is_taken(truth: NDArr
     np.testing.assert_allclose(relative, expected, atol=1e-9)
 
 
+def test_each_photo_says_whose_pose_it_has_and_by_how_much_parts_disagree_at_most(
+    truth: NDArray[np.float64],
+) -> None:
+    turned = truth[12:30].copy()
+    turned[0, :3, :3] = rotation_of(np.array([0.05, 0, 0])) @ turned[0, :3, :3]
+    parts = [
+        part("fine", np.arange(24), truth[:24], 0.001),
+        part("rough", np.arange(12, 30), turned, 0.02),
+        part("last", np.arange(10, 22), truth[10:22], 0.03),
+    ]
+    _, report = join(COUNT, parts)
+    assert report.part_of == (0,) * 24 + (1,) * 6 + (None,) * 10
+    assert report.apart_deg[12] == pytest.approx(np.degrees(0.05), rel=0.02)
+    assert max(report.apart_deg[row] or 0 for row in range(COUNT) if row != 12) < 0.2
+    fine, rough, last = parts  # the pair that comes last agrees
+    assert join(COUNT, [rough, fine, last])[1].apart_deg[12] == pytest.approx(np.degrees(0.05), rel=0.02)
+
+
 def test_seams_measure_the_noise_of_parts_and_hold_where_bounds_are_honest(
     truth: NDArray[np.float64],
 ) -> None:
