@@ -151,7 +151,7 @@ class Lane:
     async def _fits_on_disk(self, job_id: str) -> bool:
         """Whether the job's files fit on the local disk. If not, the job waits for space here or on another host."""
         size = 0
-        if not self._place.files.links_into(self._settings.data_dir):
+        if not self._place.files.links_into(self._place.scratch):
             size = await retry_while_unavailable(lambda: input_bytes(self._database, job_id))
         try:
             job_disk_budget(self._settings).require(size)
