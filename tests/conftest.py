@@ -55,6 +55,7 @@ EXPECTED_SKIPS = (
     r"all was sent before the signal came",
     r"the Kubernetes manifests are not rendered",
     r"Slurm is run by make slurm-check",
+    r"there is no second disk",
 )
 
 
