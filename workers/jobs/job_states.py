@@ -280,12 +280,15 @@ async def finish(
     *,
     partial: bool = False,
 ) -> None:
-    """Record the end of a job, and its event. Drops previews and checkpoints; `trash_attempts` deletes their files."""
+    """Record the end of a job, and its event, which is the last: parts that end later are no news of it.
+
+    Drops previews and checkpoints; `trash_attempts` deletes their files.
+    """
     await connection.execute(
         "UPDATE jobs SET state = %s, error = %s, artifacts = %s, finished_at = clock_timestamp(),"
         " eta_s = NULL, fraction = CASE WHEN %s = 'succeeded' THEN 1 ELSE fraction END,"
         " expires_at = CASE WHEN %s = 'expired' THEN clock_timestamp() ELSE expires_at END,"
-        " partial = %s, previews = NULL, checkpoint = NULL WHERE id = %s",
+        " partial = %s, previews = NULL, checkpoint = NULL, awaits_parts = false WHERE id = %s",
         (
             *(state, _error_column(error)),
             *(Jsonb([item.model_dump() for item in artifacts]), state, state, partial, job_id),

@@ -165,6 +165,22 @@ async def test_parts_are_cancelled_with_their_whole(stores: Stores, tmp_path: Pa
     ]  # fmt: skip
 
 
+async def test_the_end_of_a_whole_is_its_last_event_whenever_its_parts_end(
+    stores: Stores, tmp_path: Path
+) -> None:
+    whole, parts = await split(stores, tmp_path, 3)
+    database = stores.jobs._database
+    await taken_by_somebody(database)
+    assert await claimed(database, parts[0].id)
+    cancelled = await stores.jobs.cancel(whole.id)
+    assert [part.state for part in await parts_of(stores, whole.id)] == ["running", "cancelled", "cancelled"]
+    await end(stores, parts[0].id, "cancelled")
+    assert [event.type for event in (await stores.jobs.update(whole.id)).events] == [
+        "queued", "started", "split", "cancelled",
+    ]  # fmt: skip
+    assert (await stores.jobs.get(whole.id)).message == cancelled.message
+
+
 async def test_a_job_that_was_cancelled_first_is_not_split(stores: Stores, counting: Counting) -> None:
     await counting.submit(1, 0.0)
     await taken_by_somebody(stores.jobs._database)
