@@ -162,7 +162,7 @@ class Clients:
     async def _follow(self, job_id: str) -> list[dict[str, Any]]:
         """The whole history by server-sent events, resumed where the stream broke."""
         events: list[dict[str, Any]] = []
-        while not events or events[-1]["type"] not in FINAL:
+        while not any(event["type"] in FINAL for event in events):
             headers = {"Last-Event-ID": str(events[-1]["seq"])} if events else {}
             url = f"{self.chance.choice(self._urls)}/v1/jobs/{job_id}/events"
             with contextlib.suppress(httpx.TransportError):
