@@ -36,7 +36,7 @@ def run_of(steps: int) -> list[Progress]:
 
 def shown(monkeypatch: pytest.MonkeyPatch, stream: io.StringIO, steps: int) -> str:
     monkeypatch.setattr(sys, "stderr", stream)
-    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.setenv("COLUMNS", "97")  # at 40 % the bar then ends with a whole block
     monkeypatch.setenv("LINES", "30")  # without it tqdm does not ask for the columns
     monkeypatch.delitem(sys.modules, "ipykernel", raising=False)  # where a notebook's tests ran before
     with ShownProgress() as show:
@@ -52,9 +52,7 @@ def test_a_terminal_has_one_bar_with_the_time_left_and_news_above_it(monkeypatch
     said = shown(monkeypatch, terminal, 5)
     drawn = said.split("\r")
     assert "resuming at step 3\n" in said
-    assert re.search(
-        r"coarse  40 %\|[#█]+[\d▏▎▍▌▋▊▉]? +\| 00:0\d, step 2/5  train PSNR 12\.5 dB  0:45 left", said
-    )
+    assert re.search(r"coarse  40 %\|[#█]+ +\| 00:0\d, step 2/5  train PSNR 12\.5 dB  0:45 left", said)
     assert any(part.strip() == "a word of the log" for part in re.split(r"[\r\n]", said))
     assert drawn[-1].strip() == "", "the bar leaves nothing behind"
 

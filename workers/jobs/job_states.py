@@ -280,7 +280,7 @@ async def finish(
     *,
     partial: bool = False,
 ) -> None:
-    """Record the end of a job, and its event, which is the last: parts that end later are no news of it.
+    """Record the end of a job, and its event. Parts that end later add none to it.
 
     Drops previews and checkpoints; `trash_attempts` deletes their files.
     """
