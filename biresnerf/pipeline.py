@@ -46,7 +46,7 @@ from biresnerf.refinement.stages.checkpoint import SEEDING, TRACKS, Checkpoint, 
 from biresnerf.refinement.stages.run_state import RunState
 from biresnerf.refinement.stages.two_stages import TwoStages
 from biresnerf.refinement.start.choose_start import find_start
-from biresnerf.refinement.start.first_step import first_step, stage_lengths
+from biresnerf.refinement.start.first_step import first_step, memory_needed, stage_lengths
 from biresnerf.refinement.verdict.evaluate import Evaluation, evaluate
 from biresnerf.refinement.verdict.judgement import judge_poses
 from biresnerf.refinement.verdict.pose_uncertainty import pose_uncertainty
@@ -304,10 +304,11 @@ def _photo_counter(count: int, setup: _Setup) -> Callable[[int], None]:
 def _first_step(scene: Scene, origin: RunOrigin, setup: _Setup, observer: Observer) -> TwoStages:
     """The stages before their first step, or where earlier work ended."""
     recipe = stage_lengths(scene.start, setup.asked, setup.recipe)
+    needed = memory_needed(scene, recipe.method)
     setup.monitor.report(
         Progress(
             stage="seeding" if origin.seeding is not None else "preparing",
-            message=f"{len(scene.dataset)} images read",
+            message=f"{len(scene.dataset)} images read{needed}",
             options=recipe.options,
             reusable=reusable_seeding(setup.folder.path) if setup.earlier is None else {},
         )

@@ -89,7 +89,7 @@ def _tree(x, y, seed):
 
 
 @njit(cache=True)
-def _height(x, y, seed):
+def surface_height(x, y, seed):
     house, roof, _ = _house(x, y, seed)
     ground = _terrain(x, y, seed)
     if house:
@@ -155,7 +155,9 @@ def _tops(x0, y0, columns, rows, seed):
         for column in range(columns):
             top = -1e9
             for k in range(9):
-                top = max(top, _height(x0 + column + (k % 3 + 0.5) / 3, y0 + row + (k // 3 + 0.5) / 3, seed))
+                top = max(
+                    top, surface_height(x0 + column + (k % 3 + 0.5) / 3, y0 + row + (k // 3 + 0.5) / 3, seed)
+                )
             raw[row, column] = top
     tops = np.full((rows, columns), HIGHEST)
     for row in prange(1, rows - 1):
@@ -186,14 +188,14 @@ def _meet(origin, direction, tops, x0, y0, seed):
             before = t
             t += min(cell, above / -dz + 0.02)
             continue
-        if z <= _height(x, y, seed):
+        if z <= surface_height(x, y, seed):
             break
         before = t
         t += _STEP
     low, high = before, t
     for _ in range(5):
         t = 0.5 * (low + high)
-        if oz + t * dz > _height(ox + t * dx, oy + t * dy, seed):
+        if oz + t * dz > surface_height(ox + t * dx, oy + t * dy, seed):
             low = t
         else:
             high = t
@@ -204,14 +206,14 @@ def _meet(origin, direction, tops, x0, y0, seed):
 def _light(x, y, z, tops, x0, y0, seed):
     """The light on a surface point that is not on a wall: by its slope, and whether it is in shadow."""
     e = 0.15
-    here = _height(x, y, seed)
-    gx, gy = (_height(x + e, y, seed) - here) / e, (_height(x, y + e, seed) - here) / e
+    here = surface_height(x, y, seed)
+    gx, gy = (surface_height(x + e, y, seed) - here) / e, (surface_height(x, y + e, seed) - here) / e
     gx, gy = min(max(gx, -2.0), 2.0), min(max(gy, -2.0), 2.0)
     light = max(0.15, (_SUN[2] - gx * _SUN[0] - gy * _SUN[1]) / np.sqrt(1 + gx * gx + gy * gy))
     for k in range(1, 10):
         s = 0.4 + 1.3 * k
         xs, ys, zs = x + s * _SUN[0], y + s * _SUN[1], z + s * _SUN[2]
-        if zs < _top(xs, ys, tops, x0, y0) and zs < _height(xs, ys, seed):
+        if zs < _top(xs, ys, tops, x0, y0) and zs < surface_height(xs, ys, seed):
             return _SHADOW * light
     return light
 
@@ -223,7 +225,7 @@ def _colour(origin, direction, tops, x0, y0, seed, pixel):
     x, y, z = origin[0] + t * direction[0], origin[1] + t * direction[1], origin[2] + t * direction[2]
     finest = 2 * t * pixel
     house, _, slope = _house(x, y, seed)
-    if house and z < _height(x, y, seed) - 0.4:
+    if house and z < surface_height(x, y, seed) - 0.4:
         r, g, b = _wall_colour(x, y, z, seed, finest)
         return 0.62 * r, 0.62 * g, 0.62 * b, t
     light = _light(x, y, z, tops, x0, y0, seed)

@@ -26,8 +26,7 @@ from biresnerf.options.refine_options import ResolvedOptions, SeedingEffort
 # Shares of all steps: where cameras are adjusted first, and how long the field then learns at their poses. The first is
 # soon enough: on the dome scene cameras adjusted after half of the steps end as exact as after all (docs/estimator.md).
 FIRST_ROUND, LEARNING = 0.5, 0.25
-# Cameras: of 3,000 a candidate takes minutes, where they see what is near them (docs/estimator.md).
-LEAST_ADJUSTED, MOST_ADJUSTED = 3, 3000
+LEAST_ADJUSTED = 3  # cameras; memory alone bounds how many (`memory_needed`)
 # Shares of a training after which fields are compared. What differs clearly differs more and more (docs/verdict.md).
 LOOKS = (0.25, 0.5, 1.0)
 TRIAL_STEPS = 200  # of those that choose the start
@@ -109,7 +108,7 @@ def adjustment_work(cameras: int, observations: float) -> float:
 
 def can_be_adjusted(count: int) -> bool:
     """Whether so many cameras can be adjusted all at once."""
-    return LEAST_ADJUSTED <= count <= MOST_ADJUSTED
+    return count >= LEAST_ADJUSTED
 
 
 def step_weights(options: ResolvedOptions, *, kind: SceneKind) -> dict[Phase, float]:

@@ -10,11 +10,11 @@ from types import ModuleType
 import torch
 from torch import Tensor
 
-from biresnerf.cores import usable_cores
 from biresnerf.errors import InputError
 from biresnerf.field.occupancy import DeviceOccupancyGrid, OccupancyGrid
 from biresnerf.field.radiance_field import FieldShape, RadianceField
 from biresnerf.geometry.camera.camera import Intrinsics, directions_in_cam
+from biresnerf.machine import usable_cores
 from biresnerf.options.refine_options import Device, RefineOptions, ResolvedOptions
 
 logger = logging.getLogger(__name__)

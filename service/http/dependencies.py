@@ -15,12 +15,13 @@ from fastapi import Depends, Header, Query, Request, Response
 from fastapi import Path as PathParameter
 from pydantic import AfterValidator, BaseModel
 
+from biresnerf.machine import memory_limit
 from biresnerf.wire.base import Page
 from service.http.metrics import WebMetrics
 from service.http.problems import ProblemError
 from workers.engine import Stores
 from workers.process.disk_space import DiskBudget, upload_disk_budget
-from workers.process.memory_limits import MemoryShares, memory_limit, memory_shares
+from workers.process.memory_limits import MemoryShares, memory_shares
 from workers.process.turns import Turns
 from workers.settings.settings import Settings
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from psycopg.rows import DictRow
 from psycopg.types.json import Jsonb
 
+from biresnerf.machine import memory_limit
 from biresnerf.wire.datasets import CheckProgress, CheckReport
 from biresnerf.wire.problems import JobError
 from workers.database.claimed_work import lease_renewed
@@ -23,7 +24,7 @@ from workers.database.database import Connection, Database, Statement
 from workers.database.losses import LOSSES_MAX, LostTooOften, at_an_end, counted
 from workers.process.disk_space import EXIT_DISK
 from workers.process.locked_folders import locked_folder, sweep_folders
-from workers.process.memory_limits import CHECK_VARIABLE, memory_limit, memory_shares
+from workers.process.memory_limits import CHECK_VARIABLE, memory_shares
 from workers.process.turns import Turns
 from workers.process.waiting import retry_while_unavailable
 from workers.records import shown_folder, shown_key

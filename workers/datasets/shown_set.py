@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from biresnerf.cores import usable_cores
 from biresnerf.data.given_poses.readings import read_as
 from biresnerf.data.model.dataset import Dataset, Frame
 from biresnerf.data.photos.images import ImageSet, load_images
@@ -18,6 +17,7 @@ from biresnerf.data.scene_kind import SceneKinds
 from biresnerf.data.show.view_pictures import CELL_PX, THUMBNAIL_PX, write_contact_sheet, write_thumbnail
 from biresnerf.data.workload import can_be_adjusted, workload
 from biresnerf.forecast.rates import latest_machine, machine_rates
+from biresnerf.machine import usable_cores
 from biresnerf.options.given_poses import PoseReading
 from biresnerf.options.presets import PRESET_ON, PRESETS, ComputeDevice, PresetName
 from biresnerf.options.refine_options import RefineOptions

@@ -6,9 +6,7 @@ A container that runs out of memory is killed as a whole, with every request tha
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
-PROC, GROUPS = Path("/proc"), Path("/sys/fs/cgroup")
 # A web process itself, after heavy use.
 WEB_BYTES = 512 * 2**20
 # Without a limit. The check: numpy, Pillow, and decoders with pictures of up to 150 million pixels; a picture for
@@ -51,38 +49,3 @@ def memory_shares(limit: int | None, processes: int) -> MemoryShares:
         unpack=min(UNPACK_BYTES, for_archives // unpacks),
         unpacks=unpacks,
     )
-
-
-def memory_limit(proc: Path = PROC, groups: Path = GROUPS) -> int | None:
-    """The lowest limit of this process's control groups (version 2 or 1), bytes; None if there is none."""
-    found = []
-    for path in group_files("memory.max", "memory.limit_in_bytes", proc, groups):
-        try:
-            found.append(int(path.read_text()))
-        except (OSError, ValueError):  # no such file, or "max"
-            continue
-    # Version 1 writes "no limit" as a huge number.
-    return min((limit for limit in found if limit < 2**60), default=None)
-
-
-def group_files(name: str, name_in_v1: str, proc: Path = PROC, groups: Path = GROUPS) -> list[Path]:
-    """Possible paths of the file in this process's memory control groups, innermost first.
-
-    Inside a container its own group is the root.
-    """
-    try:
-        lines = (proc / "self" / "cgroup").read_text().splitlines()
-    except OSError:
-        return []
-    found = []
-    for line in lines:
-        number, controllers, path = line.split(":", 2)
-        if number == "0" and not controllers:
-            root, file = groups, name
-        elif "memory" in controllers.split(","):
-            root, file = groups / "memory", name_in_v1
-        else:
-            continue
-        group = root / path.lstrip("/")
-        found += [folder / file for folder in (group, *group.parents) if folder.is_relative_to(root)]
-    return found

@@ -17,6 +17,7 @@ from typing import Any, Literal
 from pydantic import TypeAdapter, ValidationError
 
 from biresnerf.errors import Fault
+from biresnerf.machine import GROUPS, PROC, group_files
 from biresnerf.options.refine_options import OPTIONS, RefineOptions, ResolvedOptions, parse_options
 from biresnerf.progress import Progress
 from biresnerf.report import Verdict, VerdictName
@@ -27,7 +28,6 @@ from workers.jobs.job_states import Requeue, is_whole
 from workers.jobs.ledger import Ledger
 from workers.jobs.setbacks import Cause, crashed_too_often, used_up
 from workers.process.disk_space import EXIT_DISK, refused_to_write
-from workers.process.memory_limits import GROUPS, PROC, group_files
 from workers.process.waiting import first_done, retry_while_unavailable
 from workers.records import CRASH_NAME, EXIT_SPLIT, LOG_NAME, SPLIT_NAME, Artifact
 from workers.run.child import Child, log_tail

@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 
 from biresnerf import __version__
-from biresnerf.cores import usable_cores
+from biresnerf.machine import usable_cores
 
 
 def describe_machine() -> str:

@@ -130,10 +130,10 @@ def expected_seconds(dataset: Dataset, asked: RefineOptions) -> dict[PresetName,
 
     Empty where one of the first photos, which show whether there is a background, cannot be decoded.
     """
-    from biresnerf.cores import usable_cores
     from biresnerf.field.backends import resolve_here
     from biresnerf.forecast.rates import machine_rates
     from biresnerf.forecast.run_forecast import Forecast
+    from biresnerf.machine import usable_cores
     from biresnerf.refinement.finish.work_ahead import expect_run
     from biresnerf.refinement.optimise.methods import Recipe
 

@@ -10,7 +10,6 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from biresnerf.cores import usable_cores
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.photos.area_resize import area_resize
 from biresnerf.data.photos.decode import decode
@@ -18,6 +17,7 @@ from biresnerf.data.photos.image_files import quiet_pillow
 from biresnerf.data.photos.kinds.photo_kinds import PLAIN_SUFFIXES
 from biresnerf.data.photos.masks import is_masked, load_mask, shrink_mask
 from biresnerf.geometry.camera.camera_models import Camera
+from biresnerf.machine import usable_cores
 from biresnerf.options.refine_options import Background
 
 T = TypeVar("T", bound=np.generic)

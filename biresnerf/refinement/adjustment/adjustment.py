@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from biresnerf.arrays import Array
+from biresnerf.data.points.tracks import Tracks
 from biresnerf.geometry.pose_error import camera_errors
 from biresnerf.geometry.similarity import align_by_spread
 from biresnerf.refinement.adjustment.cameras import POSE, Cameras
@@ -22,6 +23,7 @@ from biresnerf.refinement.adjustment.measured_terms import measured_terms
 from biresnerf.refinement.adjustment.patch_term import PatchTerm
 from biresnerf.refinement.adjustment.solver.blocks import Blocks
 from biresnerf.refinement.adjustment.solver.covariance import covariance
+from biresnerf.refinement.adjustment.solver.elimination import peak_bytes
 from biresnerf.refinement.adjustment.solver.lens_deviations import posterior
 from biresnerf.refinement.adjustment.solver.solve import Prior, minimise, normal_equations
 from biresnerf.refinement.adjustment.solver.term import Term
@@ -55,6 +57,8 @@ class Halves:
         return self.apart_deg < bound_deg and self.inliers > self.numbers.least_inliers
 
 
+# Of the matrix, at once; and bytes of an observation (`benchmarks.large.many_cameras`).
+COPIES, OBSERVATION_BYTES = 6, 500
 NOTHING_FITS = ROBUST_SCALE**2  # a misfit is below it
 
 
@@ -111,6 +115,13 @@ def adjust_poses(
         return again
     deviation = np.where(given_up, found.lenses.deviation, again.lenses.deviation)
     return replace(again, lenses=replace(again.lenses, deviation=deviation))
+
+
+def adjustment_bytes(tracks: Tracks, cameras: Cameras) -> int:
+    """Memory that adjusting cameras to tracks takes at most, by which cameras see the same points."""
+    start = np.searchsorted(tracks.point, np.arange(tracks.points + 1)).astype(np.int64)
+    tied = Blocks.tied(cameras, start, cameras.parts(tracks.image.astype(np.int64)))
+    return peak_bytes(tied) + COPIES * tied.values.nbytes + OBSERVATION_BYTES * len(tracks.point)
 
 
 def _adjusted(

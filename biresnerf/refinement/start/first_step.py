@@ -8,8 +8,12 @@ from numpy.typing import NDArray
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.data.workload import can_be_adjusted
+from biresnerf.errors import InputError
+from biresnerf.machine import free_memory
 from biresnerf.options.presets import FEWEST_OF_STAGE
 from biresnerf.options.refine_options import RefineOptions
+from biresnerf.refinement.adjustment.adjustment import adjustment_bytes
+from biresnerf.refinement.adjustment.cameras import Cameras
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.methods import Method, Recipe
 from biresnerf.refinement.parameters.intrinsics_parameters import lenses_of
@@ -17,6 +21,8 @@ from biresnerf.refinement.parameters.rigid_bodies import rigid_bodies
 from biresnerf.refinement.scene.scene import Scene
 from biresnerf.refinement.scene.scene_depth import matched_depth
 from biresnerf.refinement.scene.scene_frame import scene_frame
+
+TOLD_BYTES = 2**30  # as much as the rest of a run takes
 
 
 def first_step(scene: Scene, recipe: Recipe) -> JointOptimiser:
@@ -45,6 +51,25 @@ def adjusts_cameras(dataset: Dataset, method: Method) -> bool:
     Published methods do not.
     """
     return method.adjustment and can_be_adjusted(len(dataset))
+
+
+def memory_needed(scene: Scene, method: Method) -> str:
+    """The end of a sentence on the memory that adjusting all cameras will take; empty where it is little.
+
+    Raises:
+        InputError: ``memory_too_small``: so much is not free.
+    """
+    if scene.tracks is None or not adjusts_cameras(scene.dataset, method):
+        return ""
+    needed, free = adjustment_bytes(scene.tracks, Cameras.of(scene.start.world_from_cam)), free_memory()
+    if free is not None and needed > free:
+        raise InputError(
+            "memory_too_small",
+            f"Adjusting {len(scene.dataset)} cameras takes {needed / 2**30:.1f} GiB of memory, "
+            f"and {free / 2**30:.1f} GiB are free.",
+            hint="Use a machine with more memory; matches are kept. Or refine fewer photos, or parts of the set.",
+        )
+    return f"; adjusting all cameras takes up to {needed / 2**30:.1f} GiB" if needed > TOLD_BYTES else ""
 
 
 def pose_mobility(start: InitialPoses) -> NDArray[np.float64]:

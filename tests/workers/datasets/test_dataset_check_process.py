@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from biresnerf.cores import usable_cores
 from biresnerf.data.formats.read_dataset import read_dataset
 from biresnerf.data.photos.masks import load_mask
 from biresnerf.errors import InputError
 from biresnerf.forecast.rates import UNKNOWN, remember_rates
 from biresnerf.forecast.run_forecast import RATES
+from biresnerf.machine import usable_cores
 from biresnerf.options.presets import PRESETS
 from biresnerf.wire.datasets import CheckedPhoto, CheckReport, PhotoList
 from tests.data.formats.simple import trajectories

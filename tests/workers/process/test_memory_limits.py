@@ -19,7 +19,6 @@ from workers.process.memory_limits import (
     CHECK_VARIABLE,
     PICTURE_BYTES,
     WEB_BYTES,
-    memory_limit,
     memory_shares,
 )
 
@@ -46,43 +45,6 @@ def test_without_a_limit_a_program_may_take_what_the_largest_photo_needs() -> No
         2,
         4,
     )
-
-
-def container(folder: Path, groups: str, limits: dict[str, str]) -> tuple[Path, Path]:
-    """The files of a machine whose kernel says so."""
-    (folder / "proc/self").mkdir(parents=True)
-    (folder / "proc/self/cgroup").write_text(groups)
-    for path, limit in limits.items():
-        file = folder / "groups" / path
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(f"{limit}\n")
-    return folder / "proc", folder / "groups"
-
-
-V1, V2 = "memory/{}memory.limit_in_bytes", "{}memory.max"
-UNLIMITED = str(2**63 - 4096)
-MACHINES = {
-    "v2, in a container": ("0::/\n", {V2.format(""): str(2 * GIB)}, 2 * GIB),
-    "v2, in a group of a limited group": (
-        "0::/pod/api\n",
-        {V2.format("pod/api/"): "max", V2.format("pod/"): str(3 * GIB), V2.format(""): str(4 * GIB)},
-        3 * GIB,
-    ),
-    "v2, without a limit": ("0::/\n", {V2.format(""): "max"}, None),
-    "v1, whose path is the host's": ("4:cpu,memory:/docker/ab\n0::/\n", {V1.format(""): str(GIB)}, GIB),
-    "v1, in a limited group": ("4:memory:/a\n", {V1.format("a/"): str(GIB), V1.format(""): UNLIMITED}, GIB),
-    "v1, without a limit": ("4:memory:/\n", {V1.format(""): UNLIMITED}, None),
-}
-
-
-@pytest.mark.parametrize("machine", MACHINES)
-def test_the_containers_limit_is_the_kernels(tmp_path: Path, machine: str) -> None:
-    groups, limits, limit = MACHINES[machine]
-    assert memory_limit(*container(tmp_path, groups, limits)) == limit
-
-
-def test_without_control_groups_nothing_limits(tmp_path: Path) -> None:
-    assert memory_limit(tmp_path, tmp_path) is None
 
 
 @pytest.mark.anyio

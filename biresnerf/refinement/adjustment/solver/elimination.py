@@ -150,6 +150,32 @@ def _entries(matrix: Blocks, front: Front, free: NDArray[np.bool_]) -> Array:
     return square if kept.all() else square[np.ix_(kept, kept)]
 
 
+def peak_bytes(matrix: Blocks) -> int:
+    """The most memory that `solution` and `inverse_blocks` take beside the matrix, by the sizes of the fronts."""
+    tree, width = fronts_of(matrix), matrix.values.shape[1]
+    own = width * np.array([len(front.own) for front in tree])
+    around = width * np.array([len(front.around) for front in tree])
+    whole, factors = (own + around) ** 2, int((own * (own + around)).sum())
+    left = [0] * len(tree)
+    waiting = most = 0
+    for number, front in enumerate(tree):  # what a front leaves waits for its parent
+        most = max(most, waiting + 2 * whole[number])
+        waiting -= left[number]
+        if front.parent >= 0:
+            left[front.parent] += around[number] ** 2
+            waiting += around[number] ** 2
+    children = np.bincount([front.parent for front in tree[:-1]], minlength=len(tree))
+    kept = 0
+    for number in reversed(range(len(tree))):  # a front's inverse waits for its children
+        most = max(most, kept + 2 * whole[number])
+        kept += whole[number] if children[number] else 0
+        parent = tree[number].parent
+        if parent >= 0:
+            children[parent] -= 1
+            kept -= 0 if children[parent] else whole[parent]
+    return 8 * (factors + int(most))
+
+
 def largest_group(matrix: Blocks) -> NDArray[np.bool_]:
     """Which cameras [n] evidence ties together, directly or through others; of several groups the largest."""
     tied = (matrix.values != 0).any(axis=(1, 2)) & (matrix.other < matrix.cameras)
