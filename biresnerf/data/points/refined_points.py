@@ -75,10 +75,12 @@ def with_matched_points(refined: RefinedSet, tracks: Tracks, images: ImageSet) -
     ids = np.array(refined.image_ids)
     model_images = dict(refined.model.images)
     feature = np.zeros(len(tracks), dtype=np.int64)  # of each observation: row among its photo's features
+    by_image = np.argsort(tracks.image, kind="stable")
+    begin = np.searchsorted(tracks.image[by_image], np.arange(len(refined) + 1))
     for row, number in enumerate(refined.image_ids):
-        own = tracks.image == row
-        feature[own] = np.arange(own.sum())
-        none = np.full(own.sum(), NO_POINT)
+        own = by_image[begin[row] : begin[row + 1]]
+        feature[own] = np.arange(len(own))
+        none = np.full(len(own), NO_POINT)
         model_images[number] = replace(model_images[number], points2d_px=tracks.xy[own], point3d_ids=none)
     starts = np.concatenate(([0], np.cumsum(tracks.lengths))).astype(np.int64)
     seen = np.stack(

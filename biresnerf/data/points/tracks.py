@@ -170,7 +170,7 @@ def trace_tracks(image: NDArray[np.int64], a: NDArray[np.int64], b: NDArray[np.i
         image: of each feature, int64 [features].
         a, b: features that match, int64 [matches] each.
     """
-    label = _components(len(image), a, b)
+    label = components(len(image), a, b)
     clashing = _clashing(label, image)
     doubtful = np.flatnonzero(clashing[a])
     label[clashing] = np.flatnonzero(clashing)
@@ -216,7 +216,7 @@ def _numbered(label: NDArray[np.int64]) -> NDArray[np.int64]:
     return numbered
 
 
-def _components(nodes: int, a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.int64]:
+def components(nodes: int, a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.int64]:
     """The lowest node that each node is connected to by edges a-b, int64 [nodes]."""
     label = np.arange(nodes)
     while True:

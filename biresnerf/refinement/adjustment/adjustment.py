@@ -21,7 +21,7 @@ from biresnerf.refinement.adjustment.lens.lenses import (
 )
 from biresnerf.refinement.adjustment.measured_terms import measured_terms
 from biresnerf.refinement.adjustment.patch_term import PatchTerm
-from biresnerf.refinement.adjustment.solver.blocks import Blocks
+from biresnerf.refinement.adjustment.solver.blocks import Blocks, tied_parts
 from biresnerf.refinement.adjustment.solver.covariance import covariance
 from biresnerf.refinement.adjustment.solver.elimination import peak_bytes
 from biresnerf.refinement.adjustment.solver.lens_deviations import posterior
@@ -58,7 +58,7 @@ class Halves:
 
 
 # Of the matrix, at once; and bytes of an observation (`benchmarks.large.many_cameras`).
-COPIES, OBSERVATION_BYTES = 6, 500
+COPIES, OBSERVATION_BYTES = 6, 900
 NOTHING_FITS = ROBUST_SCALE**2  # a misfit is below it
 
 
@@ -117,11 +117,18 @@ def adjust_poses(
     return replace(again, lenses=replace(again.lenses, deviation=deviation))
 
 
-def adjustment_bytes(tracks: Tracks, cameras: Cameras) -> int:
-    """Memory that adjusting cameras to tracks takes at most, by which cameras see the same points."""
+def adjustment_bytes(tracks: Tracks, cameras: int, enough: int | None = None) -> int:
+    """Memory that adjusting so many cameras to tracks takes at most, by which of them see the same points.
+
+    Args:
+        enough: what takes more than this is not looked at closely.
+    """
     start = np.searchsorted(tracks.point, np.arange(tracks.points + 1)).astype(np.int64)
-    tied = Blocks.tied(cameras, start, cameras.parts(tracks.image.astype(np.int64)))
-    return peak_bytes(tied) + COPIES * tied.values.nbytes + OBSERVATION_BYTES * len(tracks.point)
+    block = COPIES * 8 * POSE**2
+    most = None if enough is None else enough // block
+    begin, other = tied_parts(cameras, start, tracks.image.astype(np.int64)[:, None], most)
+    needed = block * int(begin[-1]) + OBSERVATION_BYTES * len(tracks.point)
+    return needed + (peak_bytes(begin, other) if len(other) else 0)
 
 
 def _adjusted(

@@ -13,7 +13,6 @@ from biresnerf.machine import free_memory
 from biresnerf.options.presets import FEWEST_OF_STAGE
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.refinement.adjustment.adjustment import adjustment_bytes
-from biresnerf.refinement.adjustment.cameras import Cameras
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.methods import Method, Recipe
 from biresnerf.refinement.parameters.intrinsics_parameters import lenses_of
@@ -61,7 +60,8 @@ def memory_needed(scene: Scene, method: Method) -> str:
     """
     if scene.tracks is None or not adjusts_cameras(scene.dataset, method):
         return ""
-    needed, free = adjustment_bytes(scene.tracks, Cameras.of(scene.start.world_from_cam)), free_memory()
+    free = free_memory()
+    needed = adjustment_bytes(scene.tracks, len(scene.dataset), free)
     if free is not None and needed > free:
         raise InputError(
             "memory_too_small",

@@ -1,11 +1,15 @@
 """Cameras with local views: elimination front by front gives the same as one dense matrix."""
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from benchmarks.large.camera_rigs import rig
+from benchmarks.large.many_cameras import ONE_THREAD
 from biresnerf.geometry.rigid_bodies import RigidBodies
 from biresnerf.refinement.adjustment.adjustment import adjust_poses, patch_term
 from biresnerf.refinement.adjustment.cameras import Cameras
@@ -54,6 +58,10 @@ def small_fronts(monkeypatch):
     dissection._fronts.cache_clear()
 
 
+def fronts_of(system):
+    return dissection.fronts_of(system.begin, system.other)
+
+
 def linearised(given):
     cameras = Cameras.of(given.truth, given.evidence.lenses)
     term = TrackTerm(given.evidence.tracks, given.evidence.intrinsics, cameras, 0.5)
@@ -100,14 +108,14 @@ def test_fronts_solve_what_the_dense_matrix_solves(fronts):
     expected = np.zeros(len(free))
     expected[free] = np.linalg.solve(system.dense()[np.ix_(free, free)], linear.right[free])
     fronts(True)
-    assert len(dissection.fronts_of(system)) > 8
+    assert len(fronts_of(system)) > 8
     np.testing.assert_allclose(solution(system, linear.right, free), expected, rtol=1e-8, atol=1e-12)
 
 
 @pytest.mark.parametrize("shape", ["ring", "aerial"])
 def test_uncertainties_of_300_cameras_are_those_of_the_dense_inverse(shape):
     cameras, linear = linearised(rig(shape, 300))
-    assert len(dissection.fronts_of(linear.system)) > 8
+    assert len(fronts_of(linear.system)) > 8
     common = covariances.common_motions(cameras, np.ones(300, np.bool_))
     held = 1e6 * covariances.seen_aligning(common, np.ones(300, np.bool_))
     system = linear.system.with_diagonal(np.ones(1800))
@@ -117,6 +125,45 @@ def test_uncertainties_of_300_cameras_are_those_of_the_dense_inverse(shape):
     np.testing.assert_allclose(
         np.linalg.norm(found - dense, axis=(1, 2)) / np.linalg.norm(dense, axis=(1, 2)), 0, atol=1e-6
     )
+
+
+def test_thousands_of_cameras_that_share_nothing_are_eliminated_in_few_fronts():
+    """Photos without matches are groups of their own."""
+    alone = Blocks.nothing(Cameras.of(np.tile(np.eye(4), (5000, 1, 1))))
+    system = alone.with_diagonal(np.arange(1.0, 30_001))
+    assert len(fronts_of(system)) < 5000 / dissection.LEAF + 2
+    found = solution(system, np.ones(30_000), np.ones(30_000, np.bool_))
+    np.testing.assert_allclose(found, 1 / np.arange(1.0, 30_001))
+
+
+IN_ITS_OWN_PROCESS = """
+import resource, sys
+import numpy as np
+from benchmarks.large.camera_rigs import rig
+from benchmarks.large.many_cameras import ONE_THREAD
+from biresnerf.refinement.adjustment import adjustment
+from biresnerf.refinement.adjustment.solver.solve import Prior
+from biresnerf.refinement.finish.expected_errors import expected_errors
+
+def peak():
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+small = rig("ring", 12)
+poses = adjustment.adjust_poses(small.given, small.evidence, small.prior).world_from_cam
+expected_errors(poses, poses, small.evidence)
+given = rig(sys.argv[1], int(sys.argv[2]))
+before = peak()
+poses = adjustment.adjust_poses(given.given, given.evidence, given.prior).world_from_cam
+expected_errors(poses, poses, given.evidence)
+print(peak() - before, adjustment.adjustment_bytes(given.evidence.tracks, len(poses)))
+"""
+
+
+@pytest.mark.parametrize(("shape", "count"), [("aerial", 800), ("ring", 800)])
+def test_an_adjustment_takes_about_as_much_memory_as_was_said_before(shape, count):
+    command = [sys.executable, "-c", IN_ITS_OWN_PROCESS, shape, str(count)]
+    taken, said = map(int, subprocess.check_output(command, text=True, env=os.environ | ONE_THREAD).split())
+    assert 0.6 < said / taken < 1.7
 
 
 def test_blocks_of_evidence_add_up(fronts):
@@ -198,7 +245,7 @@ def test_patches_end_where_the_dense_system_leads(fronts):
     )
     fronts(True)
     cameras = Cameras.of(start)
-    assert len(dissection.fronts_of(patch_term(cameras, evidence, 1.0).linearise(cameras, 0.0).system)) > 2
+    assert len(fronts_of(patch_term(cameras, evidence, 1.0).linearise(cameras, 0.0).system)) > 2
     one, many = in_both_ways(fronts, evidence, start, PosePrior.equal(start, 0.02, 0.06))
     assert many[0].halves.apart_deg == pytest.approx(one[0].halves.apart_deg, rel=1e-5)
     assert_same(one, many)

@@ -39,15 +39,7 @@ class Blocks:
             start: [c + 1], where what is seen together begins, and ends, in parts.
             parts: [m, k], those of each observation.
         """
-        count = len(cameras) + len(cameras.lens)
-        flat = parts.reshape(-1)
-        groups = np.repeat(np.arange(len(start) - 1), np.diff(start) * parts.shape[1])
-        group = groups[np.argsort(flat, kind="stable")]
-        of_part = np.concatenate([[0], np.cumsum(np.bincount(flat, minlength=count))])
-        begin, none = np.zeros(count + 1, np.int64), np.zeros(0, np.int64)
-        seen_together(start, parts, of_part, group, begin, none)
-        other = np.empty(begin[-1], np.int64)
-        seen_together(start, parts, of_part, group, begin, other)
+        begin, other = tied_parts(len(cameras) + len(cameras.lens), start, parts)
         return cls(len(cameras), len(cameras.lens), begin, other, _room(len(other), len(cameras.lens)))
 
     @classmethod
@@ -145,6 +137,27 @@ class Blocks:
         whole[self.rows, :, self.other] = self.values
         by_column = self.in_a_row(whole.reshape(self.parts, width, -1)).T
         return np.ascontiguousarray(self.in_a_row(by_column.reshape(self.parts, width, -1)))
+
+
+def tied_parts(
+    count: int, start: NDArray[np.int64], parts: NDArray[np.int64], most: int | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """`Blocks.begin` and `Blocks.other` of so many parts, with a block for all that are seen together.
+
+    Args:
+        start, parts: as `Blocks.tied` has them.
+        most: with more blocks than this, they are only counted, and `other` is empty.
+    """
+    flat = parts.reshape(-1)
+    groups = np.repeat(np.arange(len(start) - 1), np.diff(start) * parts.shape[1])
+    group = groups[np.argsort(flat, kind="stable")]
+    of_part = np.concatenate([[0], np.cumsum(np.bincount(flat, minlength=count))])
+    begin, other = np.zeros(count + 1, np.int64), np.zeros(0, np.int64)
+    seen_together(start, parts, of_part, group, begin, other)
+    if most is None or begin[-1] <= most:
+        other = np.empty(begin[-1], np.int64)
+        seen_together(start, parts, of_part, group, begin, other)
+    return begin, other
 
 
 def _room(blocks: int, lenses: int) -> Array:

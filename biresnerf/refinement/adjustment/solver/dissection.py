@@ -8,8 +8,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from biresnerf.data.points.tracks import components
 from biresnerf.refinement.adjustment.kernels.blocks import steps_from
-from biresnerf.refinement.adjustment.solver.blocks import Blocks
 
 Parts = NDArray[np.int64]
 
@@ -40,14 +40,18 @@ class Front:
     columns: Parts
 
 
-def fronts_of(matrix: Blocks) -> tuple[Front, ...]:
-    """The fronts in order; the last has the separator of the largest group of parts, and what most are tied to."""
-    return _fronts(matrix.parts, matrix.begin.tobytes(), matrix.other.tobytes())
+def fronts_of(begin: Parts, other: Parts) -> tuple[Front, ...]:
+    """The fronts of such blocks (`Blocks`) in order.
+
+    The last has the separator of the largest group of parts, and what most are tied to.
+    """
+    return _fronts(begin.tobytes(), other.tobytes())
 
 
 @lru_cache(maxsize=4)  # the same for all steps of an adjustment
-def _fronts(count: int, begin_bytes: bytes, other_bytes: bytes) -> tuple[Front, ...]:
+def _fronts(begin_bytes: bytes, other_bytes: bytes) -> tuple[Front, ...]:
     begin, other = (np.frombuffer(each, np.int64) for each in (begin_bytes, other_bytes))
+    count = len(begin) - 1
     rows = np.repeat(np.arange(count), np.diff(begin))
     owns = _dissected(count, rows, other)
     front_of = np.empty(count, np.int64)
@@ -86,36 +90,46 @@ def _dissected(count: int, rows: Parts, columns: Parts) -> list[Parts]:
 def _dissect(
     parts: Parts, inside: NDArray[np.bool_], pairs: tuple[Parts, Parts], fronts: list[Parts]
 ) -> None:
-    """Append fronts of the parts: of the smaller side, of the larger one, and what is between both."""
-    if not len(parts):
-        return
+    """Append fronts of the parts: of each group that hangs together, its smaller side, its larger one, what is between.
+
+    Small groups share a front.
+    """
     inside[parts] = True
     among = inside[pairs[0]] & inside[pairs[1]]
     inside[parts] = False
     ours = pairs[0][among], pairs[1][among]
-    sides = None if len(parts) <= LEAF else _sides(parts, len(inside), ours)
-    if sides is None:
-        fronts.append(parts)
-        return
-    between = sides[2]
-    for side in sorted(sides[:2], key=len):
-        _dissect(side, inside, ours, fronts)
-    if len(between):
-        fronts.append(between)
+    small: list[Parts] = []
+    for group in _groups(parts, components(len(inside), *ours)[parts]):
+        sides = None if len(group) <= LEAF else _sides(group, len(inside), ours)
+        if sides is None:
+            small.append(group)
+        if small and (sides is not None or sum(map(len, small)) > LEAF):
+            fronts.append(np.concatenate(small))
+            small.clear()
+        if sides is not None:
+            for side in sorted(sides[:2], key=len):
+                _dissect(side, inside, ours, fronts)
+            fronts.append(sides[2])
+    if small:
+        fronts.append(np.concatenate(small))
+
+
+def _groups(parts: Parts, label: Parts) -> list[Parts]:
+    """Parts with the same label; the largest group last."""
+    order = np.argsort(label, kind="stable")
+    found = np.split(parts[order], np.flatnonzero(np.diff(label[order])) + 1)
+    return sorted((group for group in found if len(group)), key=len)
 
 
 def _sides(parts: Parts, count: int, pairs: tuple[Parts, Parts]) -> tuple[Parts, Parts, Parts] | None:
     """Two sides with no ties between them, and their separator; None where that is most of the parts.
 
-    Parts are ordered by how much nearer they are, in ties, to one end than to the other.
+    All parts hang together. They are ordered by how much nearer they are, in ties, to one end than to the other.
     """
     both = np.concatenate([pairs[0], pairs[1]]), np.concatenate([pairs[1], pairs[0]])
     order = np.argsort(both[0], kind="stable")
     begin, other = np.searchsorted(both[0][order], np.arange(count + 1)), both[1][order]
     first = steps_from(parts[0], begin, other)
-    reached = first[parts] >= 0
-    if not reached.all():
-        return parts[reached], parts[~reached], parts[:0]
     one = steps_from(parts[np.argmax(first[parts])], begin, other)
     two = steps_from(parts[np.argmax(one[parts])], begin, other)
     ordered = parts[np.argsort((one - two)[parts], kind="stable")]

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from biresnerf.arrays import Array
+from biresnerf.data.points.tracks import components
+from biresnerf.refinement.adjustment.cameras import POSE
 from biresnerf.refinement.adjustment.solver.blocks import Blocks
 from biresnerf.refinement.adjustment.solver.dissection import Front, fronts_of
 
@@ -59,7 +61,7 @@ def inverse_blocks(matrix: Blocks, free: NDArray[np.bool_], border: Array) -> Ar
     Args:
         border: H [u, e].
     """
-    fronts, tree = _eliminated(matrix, free, border), fronts_of(matrix)
+    fronts, tree = _eliminated(matrix, free, border), fronts_of(matrix.begin, matrix.other)
     if fronts is None:
         return None
     width, extra = matrix.values.shape[1], border.shape[1]
@@ -103,7 +105,7 @@ def _keep_own(found: Array, own: Unknowns, inverse: Array, width: int) -> None:
 
 
 def _eliminated(matrix: Blocks, free: NDArray[np.bool_], border: Array) -> list[_Eliminated] | None:
-    tree, width, extra = fronts_of(matrix), matrix.values.shape[1], border.shape[1]
+    tree, width, extra = fronts_of(matrix.begin, matrix.other), matrix.values.shape[1], border.shape[1]
     is_free, bordering = matrix.by_part(free.astype(np.float64)).reshape(-1) > 0, matrix.by_part(border)
     bordering = bordering.reshape(len(is_free), extra)
     place, left = np.empty(len(is_free), np.int64), [list[tuple[Unknowns, Tensor]]() for _ in tree]
@@ -150,9 +152,9 @@ def _entries(matrix: Blocks, front: Front, free: NDArray[np.bool_]) -> Array:
     return square if kept.all() else square[np.ix_(kept, kept)]
 
 
-def peak_bytes(matrix: Blocks) -> int:
-    """The most memory that `solution` and `inverse_blocks` take beside the matrix, by the sizes of the fronts."""
-    tree, width = fronts_of(matrix), matrix.values.shape[1]
+def peak_bytes(begin: Unknowns, other: Unknowns, width: int = POSE) -> int:
+    """The most memory that `solution` and `inverse_blocks` take beside a matrix of such `Blocks`."""
+    tree = fronts_of(begin, other)
     own = width * np.array([len(front.own) for front in tree])
     around = width * np.array([len(front.around) for front in tree])
     whole, factors = (own + around) ** 2, int((own * (own + around)).sum())
@@ -179,13 +181,5 @@ def peak_bytes(matrix: Blocks) -> int:
 def largest_group(matrix: Blocks) -> NDArray[np.bool_]:
     """Which cameras [n] evidence ties together, directly or through others; of several groups the largest."""
     tied = (matrix.values != 0).any(axis=(1, 2)) & (matrix.other < matrix.cameras)
-    rows, columns = matrix.rows[tied], matrix.other[tied]
-    group = np.arange(matrix.cameras)
-    while True:
-        joined = group.copy()
-        np.minimum.at(joined, rows, group[columns])
-        np.minimum.at(joined, columns, group[rows])
-        joined = joined[joined]
-        if (joined == group).all():
-            return np.asarray(group == np.bincount(group).argmax())
-        group = joined
+    group = components(matrix.cameras, matrix.rows[tied], matrix.other[tied])
+    return np.asarray(group == np.bincount(group).argmax())
