@@ -131,7 +131,7 @@ class AskParts:
         names = numbered_names(dataset)
         return {
             "models": [_answer(model, names)] if len(model.rows) else [],
-            "matches": [(names[a], names[b], n) for a, b, n in _matches(tracks)],
+            "matches": [(names[a], names[b], n) for a, b, n in points_in_common(tracks)],
             "parts": report.model_dump(),
         }
 
@@ -263,17 +263,18 @@ def _seam(a: PartResult, b: PartResult, apart_deg: NDArray[np.float64]) -> SeamR
     )
 
 
-def _matches(tracks: Tracks | None) -> list[tuple[int, int, int]]:
+def points_in_common(tracks: Tracks | None) -> list[tuple[int, int, int]]:
     """How many points any two photos, by row, have in common."""
     if tracks is None:
         return []
-    ends = np.cumsum(tracks.lengths)
-    pairs = [
-        pair for start, end in zip(np.concatenate(([0], ends[:-1])).tolist(), ends.tolist(), strict=True)
-        for pair in combinations(tracks.image[start:end].tolist(), 2)
-    ]  # fmt: skip
-    found, counts = np.unique(np.array(pairs), axis=0, return_counts=True)
-    return [(a, b, n) for (a, b), n in zip(found.tolist(), counts.tolist(), strict=True)]
+    point, image, keys = tracks.point, tracks.image.astype(np.int64), [np.zeros(0, np.int64)]
+    photos, step = int(image.max(initial=0)) + 1, 1
+    while (together := point[step:] == point[:-step]).any():
+        ends = image[:-step][together], image[step:][together]
+        keys.append(np.minimum(*ends) * photos + np.maximum(*ends))
+        step += 1
+    found, counts = np.unique(np.concatenate(keys), return_counts=True)
+    return list(zip((found // photos).tolist(), (found % photos).tolist(), counts.tolist(), strict=True))
 
 
 def _answer(model: MappedModel, names: Sequence[str]) -> dict[str, Any]:

@@ -7,7 +7,15 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from biresnerf.data.parts.join_parts import APART, FEW, NOTHING, PartResult, join, joined_tracks
+from biresnerf.data.parts.join_parts import (
+    APART,
+    FEW,
+    NOTHING,
+    PartResult,
+    join,
+    joined_tracks,
+    points_in_common,
+)
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.data.seeding.map_images import PARTS, MappedModel
 from biresnerf.geometry.camera.camera_models import Camera
@@ -182,3 +190,19 @@ def test_points_that_share_a_feature_of_a_photo_are_one_point() -> None:
     }
     assert seen == {((0, 1.0), (1, 2.0), (2, 3.0)), ((0, 5.0), (1, 6.0)), ((1, 8.0), (2, 9.0))}
     assert joined_tracks([None], 3) is None
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_photos_are_matched_by_the_points_that_both_see(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    seen = [rng.choice(9, int(rng.integers(2, 7)), replace=False) for _ in range(40)]
+    point, image = np.repeat(np.arange(40), [len(each) for each in seen]), np.concatenate(seen)
+    both = np.zeros((9, 9), np.int64)
+    for each in seen:
+        both[np.ix_(each, each)] += 1
+    expected = [(a, b, int(both[a, b])) for a in range(9) for b in range(a + 1, 9) if both[a, b]]
+    assert points_in_common(Tracks.of(point, image, rng.normal(size=(len(point), 2)))) == expected
+
+
+def test_photos_without_points_match_nothing() -> None:
+    assert points_in_common(None) == []
