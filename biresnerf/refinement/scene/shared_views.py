@@ -21,6 +21,7 @@ WITNESSES = 2  # other cameras that must have a point in view
 SPACING = 0.05  # of the distances tried, as a share of the cameras' distance
 SEERS, SIDE = 24, 5  # cameras tried, and pixels of each along either side
 ASKED_AT_ONCE = 64  # cameras, which settle most points where the set is large
+MOST_ASKED = 512  # cameras, of each camera's view
 
 
 def nearest_shared(
@@ -49,8 +50,8 @@ def nearest_shared(
         points = centre + steps * (in_cam.to(matrices) @ rotation.T)
         facing = matrices[:, :, 2] @ matrices[seer, :, 2] > 0
         facing[seer] = False
-        others = torch.nonzero(facing)[:, 0]
-        enough = _seen_by(others, points.reshape(-1, 3), matrices, intrinsics).sum(0) >= WITNESSES
+        others = torch.nonzero(facing)[:, 0].split(ASKED_AT_ONCE)
+        enough = _witnessed(points.reshape(-1, 3), others, matrices, intrinsics)
         witnessed += enough.numpy().reshape(len(shares), -1).mean(1)
     reached = np.flatnonzero(witnessed / len(seers) >= numbers.witnessed)
     return float(shares[reached[0]]) if len(reached) else numbers.nearest
@@ -58,6 +59,8 @@ def nearest_shared(
 
 def shared_shares(points: Tensor, seer: Tensor, unit_from_cam: Tensor, intrinsics: Intrinsics) -> Tensor:
     """Share [k] of each set of points [k, m, 3] that lies in the view of two cameras or more beside the seer's own.
+
+    Of large sets only cameras near the points count: to try all for each camera would take hours.
 
     Args:
         seer: index [k] of the camera that sees the points, or would from another pose.
@@ -67,9 +70,17 @@ def shared_shares(points: Tensor, seer: Tensor, unit_from_cam: Tensor, intrinsic
     cameras = torch.arange(len(unit_from_cam), device=points.device)
     shares = []
     for own, camera in zip(points, seer.tolist(), strict=True):
-        others = cameras[cameras != camera]
+        others = _nearest(own, cameras[cameras != camera], unit_from_cam)
         shares.append(_witnessed(own, others.split(ASKED_AT_ONCE), unit_from_cam, intrinsics).float().mean())
     return torch.stack(shares)
+
+
+def _nearest(points: Tensor, cameras: Tensor, unit_from_cam: Tensor) -> Tensor:
+    """Of many cameras those nearest to the middle of the points."""
+    if len(cameras) <= MOST_ASKED:
+        return cameras
+    apart = (unit_from_cam[cameras, :, 3] - points.mean(0)).square().sum(1)
+    return cameras[apart.topk(MOST_ASKED, largest=False).indices]
 
 
 def witnessed(points: Tensor, cameras: Tensor, unit_from_cam: Tensor, intrinsics: Intrinsics) -> Tensor:

@@ -15,6 +15,7 @@ from biresnerf.refinement.numbers.scene import FrameNumbers
 from biresnerf.refinement.scene.scene_frame import scene_frame
 from biresnerf.refinement.scene.shared_views import (
     ASKED_AT_ONCE,
+    MOST_ASKED,
     SPACING,
     nearest_shared,
     shared_shares,
@@ -65,6 +66,12 @@ def test_many_cameras_asked_some_at_a_time_say_what_all_would():
     expected = (seen.sum(0) >= 2).mean()
     assert 0.1 < expected < 0.9
     assert shares(poses, points, [last]) == [pytest.approx(expected)]
+
+
+def test_of_a_long_row_those_near_the_points_say_what_all_would():
+    points = torch.tensor([[[x, 0.0, depth]] for x in (1.0, 1500.0, 2990.0) for depth in (1.0, 10.0)])
+    assert MOST_ASKED < 1000
+    assert shares(side_by_side(3000), points, [1, 1, 0, 0, 2999, 2999]) == [0, 1, 0, 1, 0, 1]
 
 
 def test_a_camera_turned_away_shares_nothing_and_those_about_a_scene_all():

@@ -1,4 +1,4 @@
-"""Memory for the adjustment of all cameras is asked for before anything is trained."""
+"""Whether memory suffices to adjust all cameras is checked before anything is trained."""
 
 from __future__ import annotations
 
