@@ -102,8 +102,10 @@ def choose_poses(
     announce()
     chosen, evidence = choice.chosen, dict.fromkeys(results, split.fitted)
     if chosen.name in BY_TRACKS:  # nothing has to be judged any more
-        heeded_now = evidence[chosen.name] = replace(split.fitted, tracks=split.tracks)
-        result = adjust_poses(refined, heeded_now, prior, results[chosen.name].halves)
+        halves = results[chosen.name].halves
+        patches = None if halves is None else split.fitted.patches
+        heeded_now = evidence[chosen.name] = replace(split.fitted, tracks=split.tracks, patches=patches)
+        result = adjust_poses(refined, heeded_now, prior, halves)
         results[chosen.name] = result
         chosen = as_candidate(chosen.name, result, heeded_now, cameras) or chosen
     best = results.get(chosen.name) or next(iter(results.values()), None)
