@@ -138,11 +138,8 @@ def test_thousands_of_cameras_that_share_nothing_are_eliminated_in_few_fronts():
 
 IN_ITS_OWN_PROCESS = """
 import resource, sys
-import numpy as np
 from benchmarks.large.camera_rigs import rig
-from benchmarks.large.many_cameras import ONE_THREAD
 from biresnerf.refinement.adjustment import adjustment
-from biresnerf.refinement.adjustment.solver.solve import Prior
 from biresnerf.refinement.finish.expected_errors import expected_errors
 
 def peak():
@@ -159,10 +156,17 @@ print(peak() - before, adjustment.adjustment_bytes(given.evidence.tracks, len(po
 """
 
 
+def memory(shape, count):
+    """Bytes that an adjustment took, and what was said before."""
+    command = [sys.executable, "-c", IN_ITS_OWN_PROCESS, shape, str(count)]
+    printed = subprocess.check_output(command, text=True, env=os.environ | ONE_THREAD)
+    return map(int, printed.split())
+
+
 @pytest.mark.parametrize(("shape", "count"), [("aerial", 800), ("ring", 800)])
 def test_an_adjustment_takes_about_as_much_memory_as_was_said_before(shape, count):
-    command = [sys.executable, "-c", IN_ITS_OWN_PROCESS, shape, str(count)]
-    taken, said = map(int, subprocess.check_output(command, text=True, env=os.environ | ONE_THREAD).split())
+    memory(shape, 12)  # compiles, which takes much memory
+    taken, said = memory(shape, count)
     assert 0.6 < said / taken < 1.7
 
 
