@@ -116,7 +116,7 @@ def refine_poses(
         folder = OutputFolder(
             Path(output), title=_title_of(input.root) if isinstance(input, Dataset) else None
         )
-    with share.watching(), KernelCompilation() as kernels:
+    with folder.held(), share.watching(), KernelCompilation() as kernels:
         setup = _set_up(folder, options, method, on_progress, should_stop, share, kernels)
         setup = replace(setup, parts=tuple(parts))
         return _refine(input, setup, observer or Observer(), started)

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import logging
+import os
 import shutil
-from contextlib import suppress
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from biresnerf.data.model.refined_set import BODY, REFINED
@@ -15,6 +19,8 @@ from biresnerf.errors import InputError
 from biresnerf.options.formats import formats
 from biresnerf.stages import CHECKPOINT, OTHER_FOLDER
 from biresnerf.viewer.report_html import REPORT_HTML
+
+logger = logging.getLogger(__name__)
 
 REPORT, CONFIG, GEOREFERENCE = "report.json", "config.json", "georeference.json"
 RENDERS, ORBIT = "renders", "renders/orbit.mp4"
@@ -35,10 +41,49 @@ class OutputFolder:
     def preview(self) -> Path:
         return self.path / PREVIEW
 
-    def refuse_finished(self) -> None:
-        """Raise `InputError` unless the folder is new, empty, or holds an unfinished run."""
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep other runs out of the folder; afterwards remove it if it was new and is empty.
+
+        Raises:
+            InputError: ``output_in_use``.
+        """
+        self._refuse_file()
+        new = not self.path.exists()
+        self.path.mkdir(parents=True, exist_ok=True)
+        folder = os.open(self.path, os.O_RDONLY) if sys.platform != "win32" else None
+        try:
+            if folder is not None:
+                self._lock(folder)
+            yield
+        finally:
+            if folder is not None:
+                os.close(folder)  # a killed process leaves no lock behind, either
+            if new:
+                with suppress(OSError):
+                    self.path.rmdir()
+
+    def _lock(self, folder: int) -> None:
+        import fcntl
+
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            hint = "Wait until it ends, stop it, or name another folder."
+            where = str(self.path)
+            raise InputError(
+                "output_in_use", "is where another run writes.", where=where, hint=hint
+            ) from error
+        except OSError as error:
+            logger.info("%s is on a file system without locks: %s", self.path, error)
+
+    def _refuse_file(self) -> None:
         if self.path.exists() and not self.path.is_dir():
             raise InputError("output_not_a_folder", "is a file.", where=str(self.path), hint="Name a folder.")
+
+    def refuse_finished(self) -> None:
+        """Raise `InputError` unless the folder is new, empty, or holds an unfinished run."""
+        self._refuse_file()
         if not self.path.is_dir() or (self.path / CHECKPOINT).is_file():
             return
         before_training = {CHECKPOINT.parent.name, HISTORY, PREVIEW, PANORAMA_VIEWS}
@@ -75,10 +120,8 @@ class OutputFolder:
                 path.unlink(missing_ok=True)
 
     def remove_preview(self) -> None:
-        """Remove previews, and the folder where it holds nothing else."""
+        """Remove previews."""
         shutil.rmtree(self.preview, ignore_errors=True)
-        with suppress(OSError):  # not empty, or never made
-            self.path.rmdir()
 
     def remove_refined(self) -> None:
         """Remove refined poses beside those of the result."""
