@@ -137,6 +137,7 @@ def _refine(input: str | Path | Dataset, setup: _Setup, observer: Observer, star
     dataset = _as_meant(dataset, setup)
     dataset = replace(dataset, positions=position_priors(dataset), control=control_points(dataset))
     scene, origin = _seed(dataset, setup)
+    setup = replace(setup, recipe=stage_lengths(scene.start, setup.asked, setup.recipe))
     stages = _first_step(scene, origin, setup, observer)
     optimiser, run = stages.optimiser, stages.run
     WorkAhead(scene, optimiser, run).keep_to_budget(started, setup.recipe.options.steps)
@@ -260,7 +261,7 @@ def _seed(dataset: Dataset, setup: _Setup) -> tuple[Scene, RunOrigin]:
     options = recipe.options
     bodies = rigid_bodies(dataset, options)  # refuses unknown names before anything takes time
     KnownDistance.of(options.known_distance, dataset)  # so does this
-    expect_run(monitor.forecast, dataset, recipe)
+    expect_run(monitor.forecast, dataset, setup.asked, recipe)
     with SeedingPreview(dataset, folder, monitor) as preview:
         seeding = seed_poses(
             dataset,
@@ -303,17 +304,16 @@ def _photo_counter(count: int, setup: _Setup) -> Callable[[int], None]:
 
 def _first_step(scene: Scene, origin: RunOrigin, setup: _Setup, observer: Observer) -> TwoStages:
     """The stages before their first step, or where earlier work ended."""
-    recipe = stage_lengths(scene.start, setup.asked, setup.recipe)
-    needed = memory_needed(scene, recipe.method)
+    needed = memory_needed(scene, setup.recipe.method)
     setup.monitor.report(
         Progress(
             stage="seeding" if origin.seeding is not None else "preparing",
             message=f"{len(scene.dataset)} images read{needed}",
-            options=recipe.options,
+            options=setup.recipe.options,
             reusable=reusable_seeding(setup.folder.path) if setup.earlier is None else {},
         )
     )
-    optimiser = first_step(scene, recipe)
+    optimiser = first_step(scene, setup.recipe)
     repair = LostCameraRepair(optimiser, OwnMatches.of(scene))
     run = RunState(setup.folder.path, scene, origin, setup.monitor)
     preview = partial(write_preview, setup.folder, scene, optimiser, repair, run)

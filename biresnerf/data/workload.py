@@ -21,11 +21,15 @@ from biresnerf.data.seeding.map_images import (
 )
 from biresnerf.data.seeding.match_poses import can_match
 from biresnerf.forecast.run_forecast import Phase
-from biresnerf.options.refine_options import ResolvedOptions, SeedingEffort
+from biresnerf.options.presets import FEWEST_OF_STAGE
+from biresnerf.options.refine_options import RefineOptions, ResolvedOptions, SeedingEffort
 
 # Shares of all steps: where cameras are adjusted first, and how long the field then learns at their poses. The first is
 # soon enough: on the dome scene cameras adjusted after half of the steps end as exact as after all (docs/estimator.md).
 FIRST_ROUND, LEARNING = 0.5, 0.25
+# Shares of the steps, and then of stage 1's, where matches placed most cameras: the field moves them no more, and has
+# only to form for the choice of poses and for pictures (docs/speed.md).
+MATCHED, MATCHED_COARSE = 0.5, 2 / 3
 LEAST_ADJUSTED = 3  # cameras; memory alone bounds how many (`memory_needed`)
 # Shares of a training after which fields are compared. What differs clearly differs more and more (docs/verdict.md).
 LOOKS = (0.25, 0.5, 1.0)
@@ -71,15 +75,21 @@ class Workload:
     share: float
 
 
-def workload(dataset: Dataset, options: ResolvedOptions, *, kind: SceneKind, adjusts: bool) -> Workload:
+def workload(
+    dataset: Dataset, asked: RefineOptions, options: ResolvedOptions, *, kind: SceneKind, adjusts: bool
+) -> Workload:
     """All work of a run, as far as known before its features are.
 
     Args:
+        asked: options as the user gave them.
+        options: the same with every value filled in.
         kind: of the scene.
         adjusts: whether all cameras are adjusted at the end.
     """
     dataset = as_views(dataset)
     matched = options.start in ("auto", "colmap") and can_match()
+    if matched and adjusts:
+        options = matched_lengths(asked, options)
     weights = step_weights(options, kind=kind)
     share = steps_share(matched=matched and adjusts)
     coarse = options.coarse_steps_max
@@ -95,8 +105,8 @@ def workload(dataset: Dataset, options: ResolvedOptions, *, kind: SceneKind, adj
         observations = min(OBSERVED * features * len(dataset), most_observations(len(dataset)))
     if matched and options.start == "auto" and dataset.posed.any():
         amounts["trying"] = LOOKS[0] * _trial(TRIAL_STEPS, kind=kind)
-    # Mostly, matches start the run and move cameras little after it: photos need not judge that.
-    adjusting = 2 * adjustment_work(len(dataset), observations) if adjusts else 0.0
+    # Mostly, matches start the run, the first adjustment moves cameras little, and photos need not judge that.
+    adjusting = adjusts * (1 if matched else 2) * adjustment_work(len(dataset), observations)
     amounts |= after_steps(options, kind, adjusting=adjusting, checks=False)
     return Workload(amounts, weights, share)
 
@@ -120,6 +130,18 @@ def step_weights(options: ResolvedOptions, *, kind: SceneKind) -> dict[Phase, fl
 def steps_share(*, matched: bool) -> float:
     """The share of the requested steps that will be taken: fewer if matches move cameras, which then stand still."""
     return FIRST_ROUND + LEARNING if matched else 1.0
+
+
+def matched_lengths(asked: RefineOptions, options: ResolvedOptions) -> ResolvedOptions:
+    """The shorter lengths of a run whose cameras matches placed, except those that the user `asked` for."""
+    coarse = [name for name in ("coarse_steps_min", "coarse_steps_max") if getattr(asked, name) is None]
+    if asked.steps is None and len(coarse) == 2:
+        options = options.with_steps(round(MATCHED * options.steps))
+    shorter = {name: max(FEWEST_OF_STAGE, round(MATCHED_COARSE * getattr(options, name))) for name in coarse}
+    if "coarse_steps_max" in shorter:
+        least = shorter.get("coarse_steps_min", options.coarse_steps_min)
+        shorter["coarse_steps_max"] = max(least, shorter["coarse_steps_max"])
+    return options.model_copy(update=shorter)
 
 
 def after_steps(

@@ -14,7 +14,6 @@ import pytest
 import torch
 
 from biresnerf.commands.settings_option import parse_settings
-from biresnerf.data.seeding.initial_poses import InitialPoses
 from biresnerf.errors import InputError
 from biresnerf.field.radiance_field import Merging
 from biresnerf.geometry.perturb import perturb_poses
@@ -23,7 +22,6 @@ from biresnerf.refinement.finish.gather_evidence import without_patches
 from biresnerf.refinement.lost.lost_cameras import LostCameraRepair
 from biresnerf.refinement.optimise.method_changes import changed, differences
 from biresnerf.refinement.optimise.methods import BIRESNERF
-from biresnerf.refinement.start.first_step import stage_lengths
 from biresnerf.refinement.views.evaluation import fit_held_out_poses
 from biresnerf.studies.scenes import with_poses
 from tests.refinement.tiny_scene import (
@@ -32,7 +30,6 @@ from tests.refinement.tiny_scene import (
     tiny_optimiser,
     tiny_options,
     tiny_recipe,
-    tiny_run,
     tiny_set,
     true_matches,
 )
@@ -173,16 +170,6 @@ def test_a_repair_costs_no_more_than_the_method_says(tiny):
         repair.run()
         spent.append(repair.state().spent)
     assert spent[1] > 2 * spent[0]  # the first is of the scores of cameras that are not lost
-
-
-def test_stage_1_shrinks_to_the_methods_share_where_matches_placed_the_cameras(tiny):
-    matched = InitialPoses(tiny[0].world_from_cam, "matches-incremental", ("matches-incremental",) * 7)
-    asked = tiny_run().model_copy(update={"coarse_steps_max": None})
-    lengths = [
-        stage_lengths(matched, asked, tiny_recipe(changed(BIRESNERF, {"start.matched_coarse_share": share})))
-        for share in (0.6, 0.9)
-    ]
-    assert [recipe.options.coarse_steps_max for recipe in lengths] == [12, 18]  # of 20
 
 
 def test_held_out_poses_are_fitted_for_as_many_steps_as_the_method_says(tiny):

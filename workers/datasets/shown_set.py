@@ -93,8 +93,9 @@ def expected_seconds(dataset: Dataset, *, unbounded: bool) -> dict[PresetName, t
     rates, adjusts = machine_rates(device, threads), can_be_adjusted(len(as_views(dataset)))
     found: dict[PresetName, tuple[float, float]] = {}
     for preset in PRESETS:
-        options = RefineOptions(preset=preset).resolved(device)
-        work = workload(dataset, options, kind=SceneKinds().of(unbounded), adjusts=adjusts)
+        asked = RefineOptions(preset=preset)
+        kind = SceneKinds().of(unbounded)
+        work = workload(dataset, asked, asked.resolved(device), kind=kind, adjusts=adjusts)
         found[preset] = rates.between(work.amounts)
     return found
 

@@ -142,7 +142,7 @@ def expected_seconds(dataset: Dataset, asked: RefineOptions) -> dict[PresetName,
         options, device = resolve_here(asked.model_copy(update={"preset": preset}))
         threads, forecast = options.threads or usable_cores(), Forecast()
         try:
-            expect_run(forecast, dataset, Recipe.of(options, device, threads))
+            expect_run(forecast, dataset, asked, Recipe.of(options, device, threads))
         except InputError:  # --pixels says of which photo
             return {}
         found[preset] = machine_rates(device.type, threads).between(forecast.left)

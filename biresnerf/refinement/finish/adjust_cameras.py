@@ -65,7 +65,7 @@ def adjust_cameras(
     of_lenses.be_certain(focals)
     if not moves:
         return finish
-    if finish.heeds_photos:
+    if finish.moved:
         run.monitor.forecast.expect({"adjusting": 0.0})  # unless photos object
     cameras, lenses = of_lenses.refined(scene.dataset).cameras, chosen.lenses
     if lenses is not None:

@@ -43,19 +43,9 @@ class Finish:
     given: GivenPoses | None = None
 
     @property
-    def kept(self) -> bool:
-        """Whether nothing was better than the poses as they were."""
-        return any(each.chosen and each.name == "refined" for each in self.candidates)
-
-    @property
     def moved(self) -> bool:
         """Whether other poses are better than those before."""
         return any(each.chosen and each.name != "refined" for each in self.candidates)
-
-    @property
-    def heeds_photos(self) -> bool:
-        """Whether patches of the photos were to be trusted."""
-        return self.fit is not None and self.fit.evidence.patches is not None
 
     def errors_of(
         self, world_from_cam: Array, world_from_unit: Similarity, bodies: RigidBodies

@@ -1,4 +1,4 @@
-"""Stage 2 in two rounds of steps, each followed by the adjustment of all cameras."""
+"""Stage 2, and the adjustment of all cameras on the way through it."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ AFTER: tuple[Phase, ...] = ("adjusting", "evaluating", "judging")  # phases that
 
 
 def run_rounds(stages: TwoStages, scene: Scene) -> Finish:
-    """Run stage 2 in two rounds, each followed by the adjustment of all cameras; returns the last result.
+    """Run stage 2 in two rounds, with the adjustment of all cameras after the first; returns the last adjustment.
 
-    Where the first adjustment finds better poses than the field's, they stand still from then on, and the field learns
-    at them for a while. It would only bend them. They are adjusted again only if patches of the photos were not used
-    yet (the surface of a young field may have been too rough for them) and if the run's time allows. A run that was
-    resumed after the first adjustment gathers the evidence once more, and reports what was chosen then.
+    Where it finds better poses than the field's, they stand still from then on, and the field learns at them for a
+    while. It would only bend them. Where it does not, cameras are adjusted again after the last step if the run's time
+    allows. A run that was resumed after the first adjustment gathers the evidence once more, and reports what was
+    chosen then.
 
     Raises:
         Interrupted: stopped; a continued run goes on from there.
@@ -37,24 +37,24 @@ def run_rounds(stages: TwoStages, scene: Scene) -> Finish:
             optimiser.hold_poses()
             stages.begin_block()
             optimiser.end_after(LEARNING)
-        again = not (first.moved and first.heeds_photos) and _time_to_adjust_again(run, slack_s)
+        again = not first.moved and _time_to_adjust_again(run, slack_s)
         run.note(
             adjusted=True, candidates=first.candidates, believed=first.fit is not None, adjusts_again=again
         )
         stages.replan()
     stages.run_stage_2()
-    held, then = optimiser.poses_held, run.record
+    then = run.record
     again = then.adjusts_again and _time_to_adjust_again(run, slack_s)
     if first is not None and not again:
         return first
     if not again and not then.believed:
         return Finish(then.candidates)
     last = adjust_cameras(scene, optimiser.renderer, optimiser.recipe, run, repair, moves=again)
-    if again and last.moved:
+    if not again:
+        return replace(last, candidates=then.candidates)
+    if last.moved:
         optimiser.hold_poses()
-    # The poses that are held are the field's after the first adjustment.
-    chosen_then = not again or (held and last.kept)
-    return replace(last, candidates=then.candidates) if chosen_then else last
+    return last
 
 
 def _time_to_adjust_again(run: RunState, slack_s: float) -> bool:

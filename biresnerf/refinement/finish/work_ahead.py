@@ -21,7 +21,7 @@ from biresnerf.data.workload import (
 )
 from biresnerf.forecast.run_forecast import Forecast, Phase
 from biresnerf.options.presets import FEWEST_STEPS
-from biresnerf.options.refine_options import ResolvedOptions
+from biresnerf.options.refine_options import RefineOptions, ResolvedOptions
 from biresnerf.refinement.finish.photo_trial import photos_will_be_asked
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
 from biresnerf.refinement.optimise.methods import Recipe
@@ -35,13 +35,13 @@ PHOTOS_LOOKED_AT, SMALL = 3, 64  # to see whether there is a background, and px
 OVERDRAWN = 1.1  # times the budget: the report warns of more
 
 
-def expect_run(forecast: Forecast, dataset: Dataset, recipe: Recipe) -> None:
-    """Set the forecast to all of a run, as far as known before its features are."""
+def expect_run(forecast: Forecast, dataset: Dataset, asked: RefineOptions, recipe: Recipe) -> None:
+    """Set the forecast to all of a run, as far as known before its features are; `asked` by the user."""
     options = recipe.options
     few = replace(dataset, frames=dataset.frames[:PHOTOS_LOOKED_AT])
     kind = recipe.method.kinds.of(load_images(few, SMALL, options.background).background is None)
     adjusts = adjusts_cameras(as_views(dataset), recipe.method)
-    work = workload(dataset, options, kind=kind, adjusts=adjusts)
+    work = workload(dataset, asked, options, kind=kind, adjusts=adjusts)
     forecast.plan(work.step_weights, work.share)
     forecast.expect(work.amounts)
 
@@ -78,7 +78,9 @@ class WorkAhead:
         options = options or schedule.options
         coarse, fine = self._run.steps_left(step, switch, options.steps, options.coarse_steps_max)
         weights = step_weights(options, kind=schedule.kind)
-        first, again = not self._run.record.adjusted, self._run.record.adjusts_again
+        first = not self._run.record.adjusted
+        # With matches, the first adjustment mostly moves cameras, which are not adjusted again then.
+        again = self._run.record.adjusts_again and not (first and self._scene.tracks is not None)
         each = adjustment(self._scene) if self._adjusts else 0.0
         checks = self.checks() if checks is None else checks
         return {

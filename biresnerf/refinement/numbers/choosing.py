@@ -14,8 +14,6 @@ class StartNumbers:
     explains: float = 0.9
     # Of trainings in which the candidates' poses move, where those at rest do not decide.
     moving_steps: int = 400
-    # Where matches placed most cameras, stage 1 has only to form the field: its lengths shrink to this share.
-    matched_coarse_share: float = 2 / 3
     facing_first_steps: int = 800  # of cameras that begin at one place
     facing_second_steps: int = 800  # of what these find and of its mirror image
     facing_samples: int = 1 << 14  # of a step of either

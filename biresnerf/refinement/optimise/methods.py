@@ -45,7 +45,7 @@ class Method:
         two_stages: whether there is a switch; a run without one is in its last stage from the first step.
         pose_betas: of the poses' Adam.
         mobility: cameras placed by matches keep still in stage 1.
-        short_stage_1: stage 1 is shorter where matches placed most cameras.
+        short_where_matched: both stages are shorter where matches placed most cameras, if all are adjusted.
         near_plane: nothing is sampled nearer than where other cameras look too.
         weights: lost cameras weigh less in the loss.
         repair: lost cameras are given other poses.
@@ -72,7 +72,7 @@ class Method:
     two_stages: bool = False
     pose_betas: tuple[float, float] = (0.9, 0.999)
     mobility: bool = False
-    short_stage_1: bool = False
+    short_where_matched: bool = False
     near_plane: bool = False
     weights: bool = False
     repair: bool = False
@@ -146,7 +146,7 @@ BIRESNERF = Method(
     two_stages=True,
     pose_betas=(0.9, 0.99),
     mobility=True,
-    short_stage_1=True,
+    short_where_matched=True,
     near_plane=True,
     weights=True,
     repair=True,

@@ -73,7 +73,7 @@ class RunRecord(FrozenModel, arbitrary_types_allowed=True):
         adjusted: whether all cameras were adjusted on the way through stage 2.
         candidates: the poses that were compared then.
         believed: whether that evidence is believed.
-        adjusts_again: whether cameras are adjusted after the last step, too.
+        adjusts_again: whether they are adjusted after the last step, too, as nothing was better than their poses.
         best: the poses to offer before the end; None while none were better than the input's.
         seconds: spent in each part of the run.
     """

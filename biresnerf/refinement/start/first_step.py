@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from biresnerf.data.model.dataset import Dataset
 from biresnerf.data.seeding.initial_poses import InitialPoses
-from biresnerf.data.workload import can_be_adjusted
+from biresnerf.data.workload import can_be_adjusted, matched_lengths
 from biresnerf.errors import InputError
 from biresnerf.machine import free_memory
-from biresnerf.options.presets import FEWEST_OF_STAGE
 from biresnerf.options.refine_options import RefineOptions
 from biresnerf.refinement.adjustment.adjustment import adjustment_bytes
 from biresnerf.refinement.optimise.joint_optimiser import JointOptimiser
@@ -81,14 +82,8 @@ def pose_mobility(start: InitialPoses) -> NDArray[np.float64]:
 
 
 def stage_lengths(start: InitialPoses, asked: RefineOptions, recipe: Recipe) -> Recipe:
-    """The recipe with a shorter stage 1 where matches placed most cameras, unless its length was `asked` for."""
-    if not (start.mostly_matched and recipe.method.short_stage_1):
+    """The recipe with shorter stages where matches placed most cameras, except those that were `asked` for."""
+    adjusted = recipe.method.adjustment and can_be_adjusted(len(start.matched))
+    if not (adjusted and start.mostly_matched and recipe.method.short_where_matched):
         return recipe
-    resolved = recipe.options
-    names = [n for n in ("coarse_steps_min", "coarse_steps_max") if getattr(asked, n) is None]
-    share = recipe.method.start.matched_coarse_share
-    shorter = {name: max(FEWEST_OF_STAGE, round(share * getattr(resolved, name))) for name in names}
-    if "coarse_steps_max" in shorter:
-        least = shorter.get("coarse_steps_min", resolved.coarse_steps_min)
-        shorter["coarse_steps_max"] = max(least, shorter["coarse_steps_max"])
-    return recipe.changed(**shorter)
+    return replace(recipe, options=matched_lengths(asked, recipe.options))

@@ -12,6 +12,7 @@ from biresnerf.data.workload import (
     FIRST_ROUND,
     JUDGING,
     LEARNING,
+    Workload,
     adjustment_work,
     step_weights,
     workload,
@@ -19,6 +20,7 @@ from biresnerf.data.workload import (
 from biresnerf.forecast.run_forecast import Forecast
 from biresnerf.geometry.perturb import perturb_poses
 from biresnerf.geometry.similarity import Similarity
+from biresnerf.options.refine_options import RefineOptions
 from biresnerf.refinement.finish.work_ahead import expect_run
 from tests.refinement.tiny_scene import (
     TinyRun,
@@ -26,6 +28,7 @@ from tests.refinement.tiny_scene import (
     tiny_optimiser,
     tiny_options,
     tiny_recipe,
+    tiny_run,
     tiny_set,
 )
 
@@ -58,12 +61,15 @@ def test_with_tracks_fewer_steps_are_taken_and_adjusted_cameras_are_checked(run_
     assert short.forecast.left["checking"] == 0 < long.forecast.left["checking"]
 
 
-def test_what_was_adjusted_once_is_adjusted_once_more_and_not_checked_again(run_of):
-    run = run_of(TRACKS)
+@pytest.mark.parametrize(("tracks", "expected"), [(TRACKS, 1), (None, 2)])
+def test_a_second_adjustment_is_expected_only_without_matches_or_where_the_first_moved_nothing(
+    run_of, tracks, expected
+):
+    run = run_of(tracks)
     before = run.ahead.left()
     run.state.note(adjusted=True)
     after = run.ahead.left()
-    assert after["adjusting"] == before["adjusting"] / 2
+    assert after["adjusting"] == before["adjusting"] / expected > 0
     assert after["checking"] == 0
     run.state.note(adjusts_again=False)
     assert run.ahead.left()["adjusting"] == 0
@@ -104,16 +110,31 @@ def test_methods_of_others_do_not_adjust(run_of):
 
 def test_a_run_from_given_poses_is_known_before_its_first_step(scene, run_of):
     found = Forecast()
-    expect_run(found, scene[0], tiny_recipe(start="given"))
+    expect_run(found, scene[0], tiny_run(), tiny_recipe(start="given"))
     assert found.left == pytest.approx(run_of(start="given").forecast.left)
 
 
 def test_matching_is_expected_where_poses_are_compared_with_matches(scene):
     pytest.importorskip("pycolmap")
     found = Forecast()
-    expect_run(found, scene[0], tiny_recipe(start="auto"))
+    expect_run(found, scene[0], tiny_run(), tiny_recipe(start="auto"))
     assert all(found.left[phase] > 0 for phase in ("features", "matching", "mapping", "trying"))
     assert found.left["checking"] == 0, "matches mostly start the run"
+
+
+def matched_work(dataset, asked) -> Workload:
+    return workload(dataset, asked, asked.resolved("cpu"), kind=SceneKind(), adjusts=True)
+
+
+def test_half_the_steps_are_expected_where_matches_will_settle_poses_and_no_length_was_asked_for(scene):
+    pytest.importorskip("pycolmap")
+    asked = RefineOptions(preset="fast", start="auto")
+    left_open = matched_work(scene[0], asked).amounts
+    whole = matched_work(scene[0], asked.model_copy(update={"steps": 3000})).amounts
+    assert left_open["coarse"] == 0.5 * whole["coarse"]
+    assert left_open["fine"] == 0.5 * whole["fine"]
+    given = asked.model_copy(update={"start": "given"})
+    assert matched_work(scene[0], given).amounts["fine"] == (3000 - 1200) * 1.0
 
 
 def test_mapping_is_more_work_where_photos_have_more_features(scene):
@@ -122,9 +143,7 @@ def test_mapping_is_more_work_where_photos_have_more_features(scene):
     def mapping(times: int) -> float:
         cameras = tuple(c.resized(times * c.width, times * c.height) for c in scene[0].cameras)
         enlarged = replace(scene[0], cameras=cameras)
-        return workload(enlarged, tiny_options(start="auto"), kind=SceneKind(), adjusts=True).amounts[
-            "mapping"
-        ]
+        return matched_work(enlarged, tiny_run(start="auto")).amounts["mapping"]
 
     assert mapping(1) < 0.5 * len(scene[0])
     assert mapping(100) > 5 * mapping(1)

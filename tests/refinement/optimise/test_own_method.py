@@ -30,7 +30,7 @@ from tests.refinement.tiny_scene import (
 )
 
 PARTS = (
-    "mobility", "short_stage_1", "near_plane", "weights", "repair", "adjustment", "uncertainty",
+    "mobility", "short_where_matched", "near_plane", "weights", "repair", "adjustment", "uncertainty",
 )  # fmt: skip
 QUICK = {"steps": 20, "coarse_steps_min": 10, "coarse_steps_max": 10, "max_image_size": 16, "verdict": False}
 MINE = """

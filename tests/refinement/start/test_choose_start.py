@@ -216,19 +216,24 @@ def test_where_poses_as_they_are_do_not_tell_those_win_that_improve_with_the_fie
     assert choose(images, candidates(dataset, noisy, folded)).source == "given"
 
 
-def test_stage_1_is_shorter_where_matches_placed_the_cameras_and_its_length_was_left_open(scene):
+def test_stages_are_shorter_where_matches_placed_the_cameras_and_their_lengths_were_left_open(scene):
     dataset, _ = scene
     given, matched = candidates(dataset, dataset.world_from_cam, dataset.world_from_cam)
     open_options = RefineOptions(preset="fast")
     recipe = Recipe.of(open_options.resolved("cpu"), CPU, 2)
     assert stage_lengths(given, open_options, recipe) == recipe
     shorter = stage_lengths(matched, open_options, recipe).options
-    assert (shorter.coarse_steps_min, shorter.coarse_steps_max) == (400, 800)
+    assert (shorter.steps, shorter.coarse_steps_min, shorter.coarse_steps_max) == (1500, 200, 400)
+    assert (shorter.warmup_steps, shorter.trial_steps) == (100, 200)
+    all_steps = RefineOptions(preset="fast", steps=3000)
+    shorter = stage_lengths(matched, all_steps, recipe).options
+    assert (shorter.steps, shorter.coarse_steps_min, shorter.coarse_steps_max) == (3000, 400, 800)
     fixed = RefineOptions(preset="fast", coarse_steps_min=500, coarse_steps_max=900)
     long = Recipe.of(fixed.resolved("cpu"), CPU, 2)
     assert stage_lengths(matched, fixed, long) == long
-    whole = replace(recipe, method=replace(recipe.method, short_stage_1=False))
-    assert stage_lengths(matched, open_options, whole) == whole
+    for needed in ("short_where_matched", "adjustment"):
+        whole = replace(recipe, method=replace(recipe.method, **{needed: False}))
+        assert stage_lengths(matched, open_options, whole) == whole
 
 
 def test_photos_from_one_place_are_told_from_others_by_their_matches(scene):

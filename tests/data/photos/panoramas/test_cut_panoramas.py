@@ -263,9 +263,11 @@ def test_control_points_marked_in_panoramas_are_seen_in_their_views(made, tmp_pa
 
 
 def test_a_forecast_counts_the_views(made, tmp_path):
-    whole, options = read_dataset(made), RefineOptions(preset="fast").resolved("cpu")
-    foretold = workload(whole, options, kind=OPEN, adjusts=True)
-    views = workload(cut(whole, tmp_path), options, kind=OPEN, adjusts=True)
+    whole, asked = read_dataset(made), RefineOptions(preset="fast")
+    foretold, views = (
+        workload(each, asked, asked.resolved("cpu"), kind=OPEN, adjusts=True)
+        for each in (whole, cut(whole, tmp_path))
+    )
     assert foretold == views
 
 
