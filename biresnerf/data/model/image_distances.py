@@ -29,16 +29,21 @@ def _between(some: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[
 
 def nearest_pairs(apart: Distances, images: int, count: int) -> set[tuple[int, int]]:
     """Each of so many images with its ``count`` nearest."""
-    pairs: set[tuple[int, int]] = set()
+    nearest = nearest_images(apart, images, count)
+    first, second = np.repeat(np.arange(images), nearest.shape[1]), nearest.ravel()
+    low, high = np.minimum(first, second), np.maximum(first, second)
+    return set(zip(low.tolist(), high.tolist(), strict=True))
+
+
+def nearest_images(apart: Distances, images: int, count: int) -> NDArray[np.int64]:
+    """Each of so many images' nearest others, the nearest first [images, count]; fewer if there are no more."""
     everyone = np.arange(images)
+    found = np.zeros((images, min(count, images - 1)), np.int64)
     for rows in _blocks(everyone):
         distances = apart(rows, everyone)
         distances[np.arange(len(rows)), rows] = np.inf
-        nearest = np.argsort(distances, axis=1, kind="stable")[:, : min(count, images - 1)]
-        first, second = np.repeat(rows, nearest.shape[1]), nearest.ravel()
-        low, high = np.minimum(first, second), np.maximum(first, second)
-        pairs.update(zip(low.tolist(), high.tolist(), strict=True))
-    return pairs
+        found[rows] = np.argsort(distances, axis=1, kind="stable")[:, : found.shape[1]]
+    return found
 
 
 def typical_distance(apart: Distances, images: int) -> float:

@@ -25,6 +25,7 @@ from biresnerf.geometry.triangulation import parallax_deg, triangulate
 MOST_ERROR_PX, LEAST_PARALLAX_DEG = 4.0, 1.5
 LEAST_AGREEING = 0.5  # of a track's observations: two of eight wrong ones agree on something by chance
 NEAREST = 4  # cameras that carry a point along that no image is known to see
+DISTANCES_AT_ONCE = 2**22  # of points from cameras
 
 
 class FieldPoints(NamedTuple):
@@ -227,9 +228,10 @@ def _carried(
     after_from_before = after @ rigid_inverse(before)
     centres = before[:, :3, 3]
     carried = np.empty_like(xyz)
-    for part in np.array_split(np.arange(len(xyz)), -(-len(xyz) // 4096)):
+    few = min(NEAREST, len(centres))
+    for part in np.array_split(np.arange(len(xyz)), 1 + len(xyz) * len(centres) // DISTANCES_AT_ONCE):
         away = np.linalg.norm(xyz[part, None] - centres[None], axis=2)
-        nearest = np.argsort(away, axis=1)[:, :NEAREST]
+        nearest = np.argpartition(away, few - 1, axis=1)[:, :few]
         weights = 1.0 / np.maximum(np.take_along_axis(away, nearest, 1), 1e-12) ** 2
         weights /= weights.sum(1, keepdims=True)
         moved = np.einsum("mkij,mj->mki", after_from_before[nearest][..., :3, :3], xyz[part])

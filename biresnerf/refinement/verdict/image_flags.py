@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 
 from biresnerf.arrays import Array
+from biresnerf.data.model.image_distances import nearest_images, pose_distances
 from biresnerf.data.photos.images import ImageSet
 from biresnerf.refinement.numbers.choosing import VerdictNumbers
 from biresnerf.refinement.optimise.photo_sampler import PhotoSampler
@@ -21,12 +22,7 @@ DARKEST = 0.02  # mean colour below which a photo has no gain
 def sharpness(images: ImageSet, world_from_cam: Array) -> Array:
     """Variance of each photo's Laplacian [n] over the median of its neighbours', at working size."""
     variances = np.array([_laplacian_variance(images, i) for i in range(len(images))])
-    centres = world_from_cam[:, :3, 3]
-    apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
-    apart = apart / max(float(np.median(apart)), 1e-300)
-    apart += np.linalg.norm(world_from_cam[:, None, :3, 2] - world_from_cam[None, :, :3, 2], axis=2)
-    np.fill_diagonal(apart, np.inf)
-    nearest = np.argsort(apart, axis=1, kind="stable")[:, : min(NEIGHBOURS, len(images) - 1)]
+    nearest = nearest_images(pose_distances(world_from_cam), len(images), NEIGHBOURS)
     return variances / np.maximum(np.median(variances[nearest], axis=1), 1e-12)
 
 
