@@ -43,6 +43,7 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def often(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(seeding_progress, "LOOK_EVERY_S", 0.0)
+    monkeypatch.setattr(seeding_progress, "LOOK_SHARE", 1.0)
     with plain_features():
         yield
 

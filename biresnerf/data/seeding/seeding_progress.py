@@ -9,7 +9,7 @@ from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-LOOK_EVERY_S = 2.0
+LOOK_EVERY_S, LOOK_SHARE = 2.0, 0.05  # and the most of the time: thousands of photos take a second to show
 # Beside the database: the pairs to match, where not all are, and a sign that they are matched. The database does not
 # show it: pairs that contradict the others are taken out of it again.
 PAIRS, MATCHED = "pairs.txt", "matched"
@@ -81,7 +81,7 @@ class SeedingWatch:
 
     def look(self) -> None:
         """Report if it is time and there is news."""
-        if time.monotonic() < self._next:
+        if (began := time.monotonic()) < self._next:
             return
         found = read_progress(self._database, self._pairs)
         copied_at = self._time_of_copy()
@@ -89,7 +89,8 @@ class SeedingWatch:
             self._told = found
             self._tell(replace(found, kept=self._kept if copied_at != self._copied_at else None))
             self._copied_at = copied_at
-        self._next = time.monotonic() + LOOK_EVERY_S
+        ended = time.monotonic()
+        self._next = ended + max(LOOK_EVERY_S, (ended - began) / LOOK_SHARE)
 
     def _time_of_copy(self) -> int:
         if self._kept is None or not self._kept.is_file():

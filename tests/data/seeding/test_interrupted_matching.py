@@ -69,6 +69,7 @@ def test_a_search_that_is_killed_goes_on_from_its_last_copy_to_the_same_poses(
 ):
     monkeypatch.setattr(map_images, "COPY_EVERY_S", 0.0)
     monkeypatch.setattr(seeding_progress, "LOOK_EVERY_S", 0.0)
+    monkeypatch.setattr(seeding_progress, "LOOK_SHARE", 1.0)
     caplog.set_level("INFO", logger=colmap_process.__name__)
     remember, told = tmp_path / "seeding.json", []
     with pytest.raises(Interrupted):
@@ -90,6 +91,7 @@ def test_a_search_that_is_killed_goes_on_from_its_last_copy_to_the_same_poses(
 def test_a_copy_of_other_photos_is_not_taken_up(noisy, tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(map_images, "COPY_EVERY_S", 0.0)
     monkeypatch.setattr(seeding_progress, "LOOK_EVERY_S", 0.0)
+    monkeypatch.setattr(seeding_progress, "LOOK_SHARE", 1.0)
     caplog.set_level("INFO", logger=colmap_process.__name__)
     remember = tmp_path / "seeding.json"
     with pytest.raises(Interrupted):
