@@ -38,7 +38,7 @@ ENOUGH_PLACED = 0.8  # of the images: where all poses are given, no other way of
 # Growth of a model after which all of it is adjusted, where poses are given: temple takes 7.8 s in place of 16.2 with
 # 1.1, fox 13.6 in place of 20.5, and both are as exact (0.191 and 0.053 deg).
 RARELY = 1.4
-# Cameras that COLMAP adjusts directly. More are solved for iteratively: 1,177 took nine minutes, and that was one of many.
+# Cameras that COLMAP adjusts directly. More are solved for iteratively: 1,177 took nine minutes, once of many times.
 DIRECT_UP_TO, NEVER, ROUGHLY = 1000, 10**9, 2
 INTRINSICS_FROM = 0.5  # of the images: a model of fewer does not say what the lens is
 PHOTOS_AT_ONCE = 100  # between two copies of the database
