@@ -38,8 +38,6 @@ ENOUGH_PLACED = 0.8  # of the images: where all poses are given, no other way of
 # Growth of a model after which all of it is adjusted, where poses are given: temple takes 7.8 s in place of 16.2 with
 # 1.1, fox 13.6 in place of 20.5, and both are as exact (0.191 and 0.053 deg).
 RARELY = 1.4
-# Cameras that COLMAP adjusts directly. More are solved for iteratively: 1,177 took nine minutes, once of many times.
-DIRECT_UP_TO, NEVER, ROUGHLY = 1000, 10**9, 2
 INTRINSICS_FROM = 0.5  # of the images: a model of fewer does not say what the lens is
 PHOTOS_AT_ONCE = 100  # between two copies of the database
 
@@ -92,7 +90,8 @@ def map_images(request: dict[str, Any]) -> dict[str, Any]:
         keep_from_mapping(database, tracks)
 
     answer: list[dict[str, Any]] = []
-    for mapper, run in (("incremental", map_incrementally), ("global", map_globally)):
+    mappers = (("incremental", map_incrementally), ("global", map_globally))
+    for mapper, run in mappers if request["maps"] else ():
         (work / mapper).mkdir()
         models = run(database, images, work / mapper, request, numbers)
         if not models:
@@ -276,10 +275,6 @@ def map_incrementally(
     if request["likeliest"] is not None:  # all cameras are adjusted again at the end of a run
         options.ba_global_frames_ratio = options.ba_global_points_ratio = RARELY
         options.ba_global_max_refinements, options.ba_local_max_refinements = 2, 1
-        if len(request["cam_from_world"]) > DIRECT_UP_TO:
-            options.ba_global_frames_ratio = options.ba_global_points_ratio = NEVER
-            options.ba_global_frames_freq = options.ba_global_points_freq = NEVER
-            options.ba_global_max_refinements, options.ba_global_max_num_iterations = 1, ROUGHLY
     mapper, scale = options.mapper, request["error_scale"]
     mapper.init_min_num_inliers, mapper.abs_pose_min_num_inliers = 3 * LEAST_SEEN, LEAST_SEEN
     mapper.init_min_tri_angle, mapper.max_reg_trials = 8.0, 6

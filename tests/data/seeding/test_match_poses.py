@@ -224,3 +224,13 @@ def test_what_cameras_write_into_photos_does_not_keep_given_poses_from_their_mat
     assert np.median(errors_deg(best.world_from_cam, noisy.world_from_cam)) == pytest.approx(
         np.median(errors_deg(bare.world_from_cam, noisy.world_from_cam)), rel=0.2
     )
+
+
+def test_more_posed_photos_than_colmap_adjusts_directly_are_matched_and_not_mapped(
+    noisy, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(map_images, "POSED_MAPPED_UP_TO", VIEWS - 1)
+    seeding = seed_poses(noisy, remember=tmp_path / "seeding.json")
+    assert [candidate.source for candidate in seeding.candidates] == ["given"]
+    with np.load(tmp_path / "tracks.npz") as tracks:
+        assert len(tracks["point"]) > 100
