@@ -16,6 +16,7 @@ from biresnerf.data.seeding.map_images import (
     GUIDED_ALL_PAIRS_UP_TO,
     NEIGHBOURS,
     chosen_pairs,
+    is_mapped,
     pair_count,
     thoroughness,
 )
@@ -88,7 +89,8 @@ def workload(
     """
     dataset = as_views(dataset)
     matched = options.start in ("auto", "colmap") and can_match()
-    if matched and adjusts:
+    mapped = matched and (options.start == "colmap" or is_mapped(dataset))
+    if mapped and adjusts:
         options = matched_lengths(asked, options)
     weights = step_weights(options, kind=kind)
     share = steps_share(matched=matched and adjusts)
@@ -102,8 +104,9 @@ def workload(
         features, pairs, search = _search(dataset, options.seeding_effort)
         amounts["features"] = search
         amounts |= matching_work([features] * len(dataset), pairs)
+        amounts["mapping"] *= mapped
         observations = min(OBSERVED * features * len(dataset), most_observations(len(dataset)))
-    if matched and options.start == "auto" and dataset.posed.any():
+    if mapped and options.start == "auto" and dataset.posed.any():
         amounts["trying"] = LOOKS[0] * _trial(TRIAL_STEPS, kind=kind)
     # Mostly, matches start the run, the first adjustment moves cameras little, and photos need not judge that.
     adjusting = adjusts * (1 if matched else 2) * adjustment_work(len(dataset), observations)

@@ -164,7 +164,7 @@ def ask_colmap(
             "copy_every_s": COPY_EVERY_S,
             "seed": seed,
             "threads": 1 if low else -1,
-            "maps": not dataset.posed.all() or len(dataset) <= POSED_MAPPED_UP_TO,
+            "maps": is_mapped(dataset),
             "mapping_threads": 1 if low or dataset.posed.all() else -1,
         }
         pairs = pair_count(dataset, request["pairs"])
@@ -280,6 +280,11 @@ def thoroughness(dataset: Dataset, effort: SeedingEffort, count: float) -> dict[
         and widest < THOROUGH_BELOW
         and sum(c.width * c.height for c in sizes) <= THOROUGH_UP_TO,
     }
+
+
+def is_mapped(dataset: Dataset) -> bool:
+    """Whether COLMAP builds a model of the matches, or only finds them."""
+    return not dataset.posed.all() or len(dataset) <= POSED_MAPPED_UP_TO
 
 
 def chosen_pairs(count: int, each: int) -> int:

@@ -7,6 +7,7 @@ import pytest
 
 from biresnerf.data.points.tracks import Tracks
 from biresnerf.data.scene_kind import SceneKind
+from biresnerf.data.seeding import map_images
 from biresnerf.data.workload import (
     ADJUSTMENT,
     FIRST_ROUND,
@@ -135,6 +136,15 @@ def test_half_the_steps_are_expected_where_matches_will_settle_poses_and_no_leng
     assert left_open["fine"] == 0.5 * whole["fine"]
     given = asked.model_copy(update={"start": "given"})
     assert matched_work(scene[0], given).amounts["fine"] == (3000 - 1200) * 1.0
+
+
+def test_no_model_of_matches_is_expected_of_more_posed_photos_than_are_mapped(scene, monkeypatch):
+    pytest.importorskip("pycolmap")
+    monkeypatch.setattr(map_images, "POSED_MAPPED_UP_TO", len(scene[0]) - 1)
+    work = matched_work(scene[0], RefineOptions(preset="fast", start="auto")).amounts
+    assert work["coarse"] == 1200
+    assert (work["mapping"], "trying" in work) == (0, False)
+    assert work["matching"] > 0
 
 
 def test_mapping_is_more_work_where_photos_have_more_features(scene):
